@@ -14,16 +14,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from switchboard_hook import Delivery, Hook
-from switchboard_http import ask
-from switchboard_processes import running
-from switchboard_proxy import ChaosProxy
-from switchboard_robot import Robot
-from switchboard_threads import Driver
-from switchboard_waiting import wait_for
-
 from bench.relay import Relay
 from bench.report import Options, Row
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.client_threads import Driver
+from tests.worlds.http_requests import ask
+from tests.worlds.processes import running
+from tests.worlds.robot_process import Robot
+from tests.worlds.waiting import wait_for
+from tests.worlds.webhook_server import Delivery, WebhookServer
 
 BAR_SECONDS = 5
 WATCHED = 5.0
@@ -39,13 +38,14 @@ FAULTS: dict[str, Callable[[Robot, ChaosProxy], None]] = {
 class House:
     """A relay that may send to this machine, and who drives and is told."""
 
-    def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
+    def __init__(self, folder: Path, stack: contextlib.ExitStack, watched: float) -> None:
         self.relay = Relay(folder, "--webhook-networks", "127.0.0.0/8")
         stack.enter_context(running(self.relay))
-        self.hook = Hook()
+        self.hook = WebhookServer()
         stack.enter_context(running(self.hook))
         self.token = self.relay.user("boss", admin=True)
         self._robots = 0
+        self._watched = watched
 
     def pull(self, fault: Callable[[Robot, ChaosProxy], None]) -> tuple[float, int]:
         """Let a robot go dark while it is driven; seconds until that was told, and how often it was."""
@@ -61,7 +61,7 @@ class House:
                     pulled = time.monotonic()
                     fault(robot, way)
                     wait_for("the webhook hears of it", lambda: self._told(name))
-                    time.sleep(WATCHED)  # to see that it does not come twice
+                    time.sleep(self._watched)  # to see that it does not come twice
                 told = self._told(name)
                 way.heal()  # so that the daemon can say goodbye
         return told[0].at - pulled, len(told)
@@ -95,7 +95,7 @@ def run(options: Options) -> list[Row]:
     runs = options.runs or int(options.pick(1, 20))
     rows, deliveries = [], []
     with tempfile.TemporaryDirectory(prefix="bench-") as folder, contextlib.ExitStack() as stack:
-        house = House(Path(folder), stack)
+        house = House(Path(folder), stack, options.pick(0, WATCHED))
         for name, fault in FAULTS.items():
             found = [house.pull(fault) for _ in range(runs)]
             deliveries += [count for _, count in found]

@@ -23,19 +23,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from switchboard_client import Client
-from switchboard_fed import Fed
-from switchboard_processes import Process, ros_environment, running
-from switchboard_robot import Robot
-from switchboard_speech import Mouth, silence, speech
-from switchboard_threads import Listener
-from switchboard_touch import OBEYED_SECONDS
-from switchboard_waiting import wait_for
 
 from bench import ROOT, scanning, tilting
 from bench.driving import first_move
 from bench.relay import Relay
 from bench.report import Options, Row, Unavailable
+from tests.worlds.client_threads import Listener
+from tests.worlds.piped_process import PipedProcess
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.robot_process import Robot
+from tests.worlds.speech import SimulatedMicrophone, silence, speech
+from tests.worlds.sync_client import Client
+from tests.worlds.touch import OBEYED_SECONDS
+from tests.worlds.waiting import wait_for
 
 HAND = ROOT / "tests" / "e2e" / "clients" / "joystick_in_hand.py"
 HOLD, LEFT_Y = 10, 1
@@ -113,9 +113,9 @@ def words(relay: Relay, robot: Robot, environment: dict[str, str], runs: int, fi
         "--seconds",
         "0.4",
     ]
-    voice = Fed(command, relay.folder, "voice", environment)
+    voice = PipedProcess(command, relay.folder, "voice", environment)
     voice.wait_to_say("listening")
-    mouth = Mouth(os.dup(voice.feed))
+    mouth = SimulatedMicrophone(os.dup(voice.feed))
     took = []
     with running(voice, mouth):
         mouth.start()
@@ -136,7 +136,7 @@ def sticks(
 ) -> tuple[list[float], list[float]]:
     """Milliseconds from a push of the stick to the command, and to odometry of it that a client hears."""
     token = environment["SWITCHBOARD_TOKEN"]
-    pad = Fed([sys.executable, str(HAND), relay.url("rover")], relay.folder, "pad", environment)
+    pad = PipedProcess([sys.executable, str(HAND), relay.url("rover")], relay.folder, "pad", environment)
     pad.wait_to_say("no gamepad")
     odometry = Odometry(relay.connect("rover", token))
     commands, seen = [], []
@@ -198,17 +198,17 @@ def looks(runs: int) -> list[float]:
     from skimage import data
 
     from robot_client.services.camera_model import of_view
-    from robot_client.services.faces import Finder, KnownFaces, grey_of, look
+    from robot_client.services.faces import FaceFinder, KnownFaces, find_faces, grey_of
 
     cv2.setNumThreads(1)
     pixels = np.full((480, 640, 3), 110, np.uint8)
     pixels[:, :512] = data.astronaut()[:480, :, ::-1]
-    finder, people, lens = Finder(), KnownFaces(), of_view(640, 480, 75)
+    finder, people, lens = FaceFinder(), KnownFaces(), of_view(640, 480, 75)
     people.add("eileen", grey_of(pixels), finder.find(grey_of(pixels))[0])
     took = []
     for _ in range(runs):
         began = time.perf_counter()
-        look(pixels, lens, finder, people)
+        find_faces(pixels, lens, finder, people)
         took.append((time.perf_counter() - began) * 1000)
     return took
 
@@ -260,7 +260,7 @@ def _pair(what: str, took: list[float], bar: float | None = None, note: str = ""
 
 
 def _scanned(took: list[float]) -> list[Row]:
-    what = f"runaway: a robot's scan of {scanning.RAYS} rays, from its stamp until decided upon"
+    what = f"avoidance: a robot's scan of {scanning.RAYS} rays, from its stamp until decided upon"
     note = (
         f"of {len(took)} scans of a simulated robot, by ROS 2, daemon, relay and websocket; the stamp is of before it "
         "looks"
@@ -304,9 +304,9 @@ def run(options: Options) -> list[Row]:
                 tilted = _tilted(relay, robot, environment, runs, first)
                 heard = words(relay, robot, environment, runs, first)
                 greeted = greetings(relay, environment, runs)
-            drives = int(options.pick(1, 10))
-            charged = recharges(relay, environment, drives)
-    rows = _pair(f"runaway: a scan of {scanning.RAYS} rays read and decided upon", at_once, SCAN_BAR_MS)
+            drives = int(options.pick(0, 10))
+            charged = recharges(relay, environment, drives) if drives else []
+    rows = _pair(f"avoidance: a scan of {scanning.RAYS} rays read and decided upon", at_once, SCAN_BAR_MS)
     rows += _scanned(scanned)
     rows += _pair("joystick: stick pushed → command carried out", commands, STICK_BAR_MS)
     rows += _pair("joystick: stick pushed → odometry of it is back", seen, STICK_BAR_MS)

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
 from typing import Any
 
 import cv2
 import numpy as np
 from playwright.sync_api import Browser, Page
-from switchboard_browser import chromium
 
 import relay_server
 from bench.cameras import CAMERAS, TOPIC, USERS, Clock, Scene, counts, glass_to_glass, scene
 from bench.report import Options, Row, Unavailable
+from tests.worlds.browser import chromium, chromium_path
 
 PATIENCE_MS = 30_000
 
@@ -115,8 +114,8 @@ def run(options: Options) -> list[Row]:
 
     :raises Unavailable: there is no Chromium, or no portal to open
     """
-    if shutil.which("chromium") is None:
-        raise Unavailable("no Chromium (Debian: apt install chromium)")
+    if chromium_path() is None:
+        raise Unavailable("no Chromium (Debian: apt install chromium-headless-shell)")
     if not (relay_server.PORTAL / "index.html").is_file():
         raise Unavailable("the portal is not built (make web)")
     rows = []

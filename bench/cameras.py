@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from switchboard_http import ask
-from switchboard_processes import running
-from switchboard_proxy import ChaosProxy
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
 
 from bench.relay import Relay
 from bench.report import Options, Row
 from robot_client.sim.camera import HEIGHT, WIDTH, draw_clock
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.http_requests import ask
+from tests.worlds.processes import running
+from tests.worlds.robot_process import Robot
+from tests.worlds.waiting import wait_for
 
 TOPIC = "/camera/image_raw"
 USERS = ("first", "second", "third")

@@ -17,10 +17,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from switchboard_load import status_of
-from switchboard_processes import running
-from switchboard_waiting import wait_for
-
 from bench.child import Child
 from bench.cpu import resident, seconds_of
 from bench.native import Receivers
@@ -28,6 +24,9 @@ from bench.report import Options, Row
 from bench.robot import RealRobot, real_robot, settle
 from bench.viewers import subscribe
 from bench.wire import handshake
+from tests.worlds.processes import running
+from tests.worlds.ros_load import status_of
+from tests.worlds.waiting import wait_for
 
 CLOUD, SCAN = "/bench/cloud", "/bench/scan"
 SMALL = [f"/bench/s{number}" for number in range(8)]
@@ -144,19 +143,19 @@ def breaking(robot: RealRobot) -> Iterator[dict[str, int]]:
 
 def run(options: Options) -> list[Row]:
     """One alone, then all."""
-    seconds = options.seconds or options.pick(3, CROWD_SECONDS)
-    part = 0.2 if options.quick else 1.0
+    seconds = options.seconds or options.pick(1, CROWD_SECONDS)
+    part = 0.05 if options.quick else 1.0
     with real_robot(STREAMS) as robot, contextlib.ExitStack() as stack:
         ground = Ground(robot)
         stack.callback(lambda: [each.stop() for each in ground.watching.values()])
         ground.come(Group("alone", 1, ALL), 1)
         wait_for("the first client has something of all", lambda: _topics(ground, "alone") == set(ALL), 30)
         settle(options)
-        alone = ground.spell(options.pick(1, ALONE_SECONDS))
+        alone = ground.spell(options.pick(0.3, ALONE_SECONDS))
         for group in GROUPS:
             ground.come(group, max(1, round(group.count * part)))
-        time.sleep(options.pick(1, WARM_SECONDS))  # the crowd's coming is not to be measured
-        peaceful = ground.spell(options.pick(1, ALONE_SECONDS))
+        time.sleep(options.pick(0.3, WARM_SECONDS))  # the crowd's coming is not to be measured
+        peaceful = ground.spell(options.pick(0.3, ALONE_SECONDS))
         with breaking(robot) as broken:
             crowd = ground.spell(seconds)
         dropped = status_of(robot.relay, robot.name)["health"]["dropped_samples"]

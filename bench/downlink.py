@@ -13,14 +13,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from switchboard_processes import running
-from switchboard_proxy import ChaosProxy
-
 from bench.messages import STRING, TWIST
 from bench.relay import Relay
 from bench.report import Options, Row
 from bench.wire import Loop, PlainRobot, WebEnd
 from relay_protocol import jsontext
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.processes import running
 
 KILOBYTES = (300, 100)
 """A second, down to the client."""
@@ -127,7 +126,7 @@ def _command(watcher: Watcher) -> None:
 def run(options: Options) -> list[Row]:
     """Each line in turn."""
     rows = []
-    seconds = options.pick(3, 30)
+    seconds = options.pick(1, 30)
     for kilobytes in KILOBYTES[:1] if options.quick else KILOBYTES:
         with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
             relay = Relay(Path(name), "--heartbeat", "60")

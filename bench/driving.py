@@ -14,12 +14,12 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
-from switchboard_client import Client
-from switchboard_drive import LET_GO_SECONDS
-from switchboard_waiting import wait_for
 from websockets.sync.client import connect
 
 from bench.child import Child
+from tests.worlds.driving import LET_GO_SECONDS
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 TOPIC = "/cmd_vel"
 TWIST = "geometry_msgs/msg/Twist"

@@ -13,9 +13,6 @@ import subprocess
 import sys
 import time
 
-from switchboard_processes import running
-from switchboard_waiting import wait_for
-
 from bench.child import Child, free_port
 from bench.cpu import seconds_of
 from bench.native import Receivers
@@ -23,6 +20,8 @@ from bench.report import Options, Row
 from bench.robot import RealRobot, real_robot, settle
 from bench.viewers import SCAN, STREAM, TOPIC, subscribe
 from bench.wire import handshake
+from tests.worlds.processes import running
+from tests.worlds.waiting import wait_for
 
 VIEWERS = 10
 
@@ -67,7 +66,7 @@ def watched(
 
 def run(options: Options) -> list[Row]:
     """Some windows of time; medians of processor milliseconds a second."""
-    seconds, rounds = options.pick(1, 8), int(options.pick(1, 3))
+    seconds, rounds = options.pick(0.3, 8), int(options.pick(1, 3))
     with real_robot([STREAM]) as robot, contextlib.ExitStack() as stack:
         relay = robot.relay
         settle(options)

@@ -17,8 +17,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from switchboard_processes import running
-
 from bench.cpu import measured
 from bench.messages import STRING, text_of
 from bench.native import Native, Receivers
@@ -27,6 +25,7 @@ from bench.report import Options, Row
 from bench.wire import Loop, PlainRobot, handshake, text_frame
 from relay_protocol import jsontext
 from relay_protocol.ros_types import TypeRegistry
+from tests.worlds.processes import running
 
 RATE = 100.0
 SIZE = 1000
@@ -102,7 +101,7 @@ def loop_side(folder: Path, clients: int, stack: contextlib.ExitStack) -> Side:
 
 def run(options: Options) -> list[Row]:
     """Both in turn; medians."""
-    clients = int(options.pick(20, 500))
+    clients = int(options.pick(5, 500))
     seconds = options.pick(0.3, 6)
     loop = Loop()
     with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from switchboard_processes import running
-
 from bench.cpu import measured
 from bench.messages import STRING, TWIST, text_of
 from bench.relay import Relay
@@ -24,6 +22,7 @@ from bench.websockify import Websockify
 from bench.wire import End, Loop, PlainRobot, WebEnd, flood, one_at_a_time, text_frame
 from relay_protocol import jsontext
 from relay_protocol.ros_types import TypeRegistry
+from tests.worlds.processes import running
 
 SMALL, LARGE = 200, 64 * 1024
 WINDOW_SMALL, WINDOW_LARGE = 256, 8
@@ -51,6 +50,7 @@ def twist_message(topic: str, size: int) -> bytes:
 class Hop:
     """A way to measure: what is sent, by whom, and how it is known to have come.
 
+    :param pids: processes whose processor time counts
     :param window: messages under way at most; with ``single`` one
     :param receiver: where it arrives
     """
@@ -58,14 +58,14 @@ class Hop:
     sender: End
     message: bytes
     received: Callable[[], int]
-    pid: int
+    pids: tuple[int, ...]
     window: int
     single: bool = False
     receiver: End | None = None
 
     def run(self, loop: Loop, total: int) -> float:
         """Microseconds of processor time per message."""
-        with measured(self.pid, children=True) as watch:
+        with measured(*self.pids, children=True) as watch:
             if self.single:
                 one_at_a_time(loop, self.sender, self.message, total, self.received)
             else:
@@ -119,7 +119,7 @@ class Ground:
         robot = self.robots[encoding]
         sender = self.clients[encoding]
         return Hop(
-            sender, text_frame(message), lambda: robot.received, self.pid, window, single, robot.channel
+            sender, text_frame(message), lambda: robot.received, (self.pid,), window, single, robot.channel
         )
 
     def to_client(self, encoding: str, size: int, window: int, *, single: bool = False) -> Hop:
@@ -127,7 +127,7 @@ class Ground:
         robot, client = self.robots[encoding], self.clients[encoding]
         sample = self._sample(robot, size)
         assert robot.channel is not None
-        return Hop(robot.channel, sample, lambda: client.messages, self.pid, window, single, client)
+        return Hop(robot.channel, sample, lambda: client.messages, (self.pid,), window, single, client)
 
 
 @contextlib.contextmanager
@@ -156,10 +156,10 @@ def through_websockify(
     payload = b"x" * size
     if to_server:
         message = text_frame(payload, binary=True)
-        return Hop(ends.client, message, lambda: ends.server.messages, ends.pid, window, single)
+        return Hop(ends.client, message, lambda: ends.server.messages, (ends.pid,), window, single)
     client = ends.client
     # A stream has no messages: what comes together is sent as one. Bytes are counted.
-    return Hop(ends.server, payload, lambda: client.payload_bytes // size, ends.pid, window, single)
+    return Hop(ends.server, payload, lambda: client.payload_bytes // size, (ends.pid,), window, single)
 
 
 @dataclass
@@ -176,8 +176,8 @@ class Case:
 
 def cases(ground: Ground, proxy: Any, options: Options) -> list[Case]:
     """All that is measured, with the number of messages of a round."""
-    many, few = int(options.pick(2000, 50_000)), int(options.pick(40, 1000))
-    singles = int(options.pick(50, 3000))
+    many, few = int(options.pick(200, 50_000)), int(options.pick(10, 1000))
+    singles = int(options.pick(10, 3000))
     up_small = through_websockify(proxy, SMALL, to_server=True, window=WINDOW_SMALL)
     down_single = through_websockify(proxy, SMALL, to_server=False, window=1, single=True)
     up_large = through_websockify(proxy, LARGE, to_server=True, window=WINDOW_LARGE)

@@ -19,12 +19,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from switchboard_hostile import Attack, Reactor, exchange, request, send, unproved
-from switchboard_processes import running
-
 from bench.child import Child
 from bench.relay import Relay
 from bench.report import Options, Row
+from tests.worlds.hostile_inputs import Attack, Reactor, exchange, request, send, unproved
+from tests.worlds.processes import running
 
 TRIES = 3
 BAR_MS = 50.0

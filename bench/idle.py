@@ -7,13 +7,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_processes import running
-
 from bench.cpu import resident
 from bench.native import Receivers
 from bench.relay import Relay
 from bench.report import Options, Row
 from bench.wire import Loop, PlainRobot, handshake
+from tests.worlds.processes import running
 
 FIRST = 100
 """Clients that come before, so that what the relay takes once is not counted."""
@@ -32,7 +31,7 @@ def settled(loop: Loop, pid: int, seconds: float) -> int:
 
 def run(options: Options) -> list[Row]:
     """Once; memory does not jitter as times do."""
-    clients = int(options.pick(50, 1000))
+    clients = int(options.pick(10, 1000))
     seconds = options.pick(0.5, SETTLE_SECONDS)
     with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)

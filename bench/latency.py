@@ -12,7 +12,6 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_processes import running
 from websockets.frames import Frame, Opcode
 
 from bench.haproxy import HAProxy, executable
@@ -20,6 +19,7 @@ from bench.hop import SMALL, Ground, Hop, text_message
 from bench.relay import Relay
 from bench.report import Options, Row
 from bench.wire import Loop, text_frame
+from tests.worlds.processes import running
 
 RATE = 500.0
 
@@ -50,14 +50,14 @@ def through_haproxy(proxy: HAProxy) -> dict[str, Hop]:
     up, down = text_frame(payload), Frame(Opcode.TEXT, payload).serialize(mask=False)
     client, server = proxy.client, proxy.server
     return {
-        "up": Hop(client, up, lambda: server.messages, proxy.pid, 1, receiver=server),
-        "down": Hop(server, down, lambda: client.messages, proxy.pid, 1, receiver=client),
+        "up": Hop(client, up, lambda: server.messages, (proxy.pid,), 1, receiver=server),
+        "down": Hop(server, down, lambda: client.messages, (proxy.pid,), 1, receiver=client),
     }
 
 
 def measure(loop: Loop, what: str, ours: Hop, theirs: Hop, options: Options) -> Row:
     """Ours and theirs in turn; the median of all."""
-    count, rounds = int(options.pick(30, 1500)), int(options.pick(1, 3))
+    count, rounds = int(options.pick(10, 1500)), int(options.pick(1, 3))
     mine: list[float] = []
     other: list[float] = []
     for _ in range(rounds):

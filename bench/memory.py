@@ -16,9 +16,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from switchboard_processes import running
-from switchboard_waiting import wait_for
-
 from bench.cpu import measured
 from bench.relay import Relay
 from bench.report import Options, Row
@@ -26,6 +23,8 @@ from relay_db import queries
 from relay_db.base import canonical_json
 from relay_db.engine import Database
 from relay_db.queries import NewStoredEvent
+from tests.worlds.processes import running
+from tests.worlds.waiting import wait_for
 
 EVENTS = "/api/v1/events"
 SHARE = 5000
@@ -165,7 +164,7 @@ def fill(relay: Relay, count: int) -> None:
     for first in range(0, count, 10_000):
         last = min(count, first + 10_000)
         with database.begin() as s:
-            queries.remember(
+            queries.store_events(
                 s, [_event(n, now - DAYS * 86400 * (1 - n / count), robot.id) for n in range(first, last)]
             )
     database.close()

@@ -13,7 +13,7 @@ from bench.plot import plot
 from bench.report import Row, figure, ratio_text
 
 PAGE = ROOT / "docs" / "performance.md"
-PICTURE = ROOT / "docs" / "performance.svg"
+PICTURE = ROOT / "docs" / "images" / "performance.svg"
 BEGIN, END = "<!-- figures: python -m bench.page -->", "<!-- end of figures -->"
 _MET = {True: "yes", False: "**no**", None: ""}
 
@@ -22,8 +22,8 @@ WHY = {
         "hop",
         "client → JSON robot, 200 B",
     ): "websockify unmasks a message and writes it on unread. The relay reads "
-    "each one and judges it by right and by age before it hands it on. What is left of that is about ten Python calls "
-    "and a pass of msgspec.",
+    "each one and judges it by right and by age before it hands it on. About ten Python calls and a pass of "
+    "msgspec are left of that.",
     (
         "hop",
         "CDR robot → client, 64 KiB",

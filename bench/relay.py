@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import switchboard_relay
 from click.testing import CliRunner
 
 from relay_server.cli import main
+from tests.worlds import relay_process
 
 
-class Relay(switchboard_relay.Relay):
+class Relay(relay_process.Relay):
     """``switchboard serve`` on a data folder; admin commands run in this process."""
 
     def cli(self, *arguments: str, stdin: str = "") -> Any:

@@ -12,14 +12,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from switchboard_domains import free_domain
-from switchboard_processes import BIN, Process, ros_environment, running
-from switchboard_proxy import ChaosProxy
-from switchboard_waiting import wait_for
-
 from bench.child import Child
 from bench.relay import Relay
 from bench.report import Options, Unavailable
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.processes import BIN, Process, ros_environment, running
+from tests.worlds.ros_domains import free_domain
+from tests.worlds.waiting import wait_for
 
 SETTLE_SECONDS = 8.0
 """A daemon that has just come up is busy for some seconds with what it finds."""

@@ -1,6 +1,6 @@
 """A ROS 2 node that publishes numbered messages at steady rates. Started by the measurements, as a process.
 
-Argument: JSON, a list of {"topic", "kind" ("string", "scan" or "cloud"), "rate" (per second), "size" (bytes)}.
+Argument: JSON, a list of {"topic", "kind" ("string", "scan", "image" or "cloud"), "rate" (per second), "size" (bytes)}.
 Prints READY; a line on the standard input is answered by the numbers published so far, as JSON. Ends with it. Each
 message begins with ``#<number>@<monotonic nanoseconds>``, in ``data`` or in the header's ``frame_id``.
 """
@@ -17,7 +17,7 @@ from typing import Any
 import numpy
 import rclpy
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import LaserScan, PointCloud2, PointField
+from sensor_msgs.msg import Image, LaserScan, PointCloud2, PointField
 from std_msgs.msg import String
 
 BEAMS = 1080
@@ -33,6 +33,10 @@ def maker(kind: str, size: int) -> tuple[type, Callable[[str], Any]]:
         scan.ranges = noise.uniform(0.2, 30, BEAMS).astype("f4").tolist()
         scan.intensities = noise.uniform(0, 255, BEAMS).astype("f4").tolist()
         return LaserScan, lambda mark: marked(scan, mark)
+    if kind == "image":
+        image = Image(height=480, width=640, encoding="rgb8", step=1920)
+        image.data = noise.integers(0, 256, 480 * 1920, "u1").tobytes()
+        return Image, lambda mark: marked(image, mark)
     points = size // 16
     cloud = PointCloud2(height=1, width=points, point_step=16, row_step=16 * points, is_dense=True)
     cloud.fields = [

@@ -1,4 +1,4 @@
-"""Scans that ``runaway`` reads and decides upon: one that is always there, and those of a simulated robot.
+"""Scans that ``avoidance`` reads and decides upon: one that is always there, and those of a simulated robot.
 
 The first tells what the program itself takes. The second begins with the time that the robot writes into a scan before
 it looks, and goes by ROS 2, daemon, relay and websocket into the same parts of the program, on the same clock.
@@ -11,12 +11,11 @@ import math
 import time
 from typing import Any
 
-from switchboard_client import Client
-from switchboard_waiting import wait_for
-
 from bench.relay import Relay
 from robot_client.apps.collision_avoidance import AvoidanceConfig, AvoidanceLink, CollisionAvoidance
 from robot_client.apps.connection import RosbridgeConnection
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 SCAN, COMMAND = "/scan", "/cmd_vel"
 RAYS = 360
@@ -73,7 +72,7 @@ class Kept:
 
 
 def program(connection: Any) -> tuple[AvoidanceLink, CollisionAvoidance]:
-    """The parts of ``runaway`` that read and decide, on a websocket."""
+    """The parts of ``avoidance`` that read and decide, on a websocket."""
     return AvoidanceLink(RosbridgeConnection(connection), SCAN, COMMAND), CollisionAvoidance(
         AvoidanceConfig()
     )
@@ -81,13 +80,13 @@ def program(connection: Any) -> tuple[AvoidanceLink, CollisionAvoidance]:
 
 def constant(runs: int) -> list[float]:
     """Milliseconds to read a scan that is there and to decide."""
-    link, runaway = program(Constant())
+    link, avoidance = program(Constant())
     took = []
     for _ in range(runs):
         began = time.perf_counter()
         scan = link.scan(1.0)
         assert scan is not None
-        runaway.see(scan)
+        avoidance.update(scan)
         took.append((time.perf_counter() - began) * 1000)
     return took
 
@@ -105,11 +104,11 @@ def of_a_robot(relay: Relay, robot: str, token: str, runs: int) -> list[float]:
     with relay.connect(robot, token) as client:
         wait_for("its topics are known", lambda: {SCAN, COMMAND} <= _topics(client))
         kept = Kept(client.connection)
-        link, runaway = program(kept)
+        link, avoidance = program(kept)
         for number in range(FIRST + runs):
             scan = link.scan(PATIENCE)
             assert scan is not None, f"no scan within {PATIENCE:g} s"
-            runaway.see(scan)
+            avoidance.update(scan)
             decided = time.time_ns()
             if number >= FIRST:
                 took.append((decided - kept.stamp()) / 1e6)

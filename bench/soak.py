@@ -10,13 +10,12 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from switchboard_load import Counter, Publisher, meter_of, status_of
-from switchboard_processes import running
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
-
 from bench.relay import Relay
 from bench.report import Options, Row
+from tests.worlds.processes import running
+from tests.worlds.robot_process import Robot
+from tests.worlds.ros_load import Counter, Publisher, meter_of, status_of
+from tests.worlds.waiting import wait_for
 
 TOPICS = ("small", "big")
 RATE = 1000.0
@@ -26,8 +25,8 @@ WARM_SECONDS = 5.0
 
 def run(options: Options) -> list[Row]:
     """Watch one load from its beginning to its end."""
-    seconds = options.seconds or options.pick(3, SECONDS)
-    warm = options.pick(0.5, WARM_SECONDS)
+    seconds = options.seconds or options.pick(2, SECONDS)
+    warm = options.pick(0.2, WARM_SECONDS)
     with tempfile.TemporaryDirectory(prefix="bench-") as folder, contextlib.ExitStack() as stack:
         relay = Relay(Path(folder))
         stack.enter_context(running(relay))

@@ -20,12 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from switchboard_drive import LIMIT_MS, SIM_STEP_MS, Drive
-
 from bench.driving import DriverProcess, TimedDriver, ages_ms, connected, sent_before
 from bench.report import Options, Row, Unavailable
 from bench.tab import FAULTS as tab_faults
 from bench.tab import Tab, struck
+from tests.worlds.driving import LIMIT_MS, SIM_STEP_MS, Drive
 
 HELD_BACK = 0.6
 """Seconds until what is held up by a fault is older than any command may be."""

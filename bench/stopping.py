@@ -17,11 +17,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from switchboard_client import Client
-from switchboard_processes import BIN, Process, ros_environment, running
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
-
 from bench.cameras import CAMERAS, Camera
 from bench.crowd import CLOUD, TYPES
 from bench.driving import AHEAD, EVERY, TOPIC, TURN, TWIST, connected, take_control
@@ -32,6 +27,10 @@ from bench.robot import Publisher
 from bench.video import Viewers
 from bench.viewers import subscribe
 from bench.wire import handshake
+from tests.worlds.processes import BIN, Process, ros_environment, running
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 STREAM = {"topic": CLOUD, "kind": "cloud", "rate": 10.0, "size": 300_000}
 BAR_MS = 100
@@ -70,7 +69,7 @@ class Holder(threading.Thread):
         self._client.drive(0.0)
         if not self._resumed.is_set():
             answer = self._client.call("/relay/resume", {"why": "bench"})
-            if not answer["result"] and "after you asked for this" in answer["values"]:
+            if not answer["result"] and "after you sent this" in answer["values"]:
                 # No ping has come back since the stop: nobody can tell yet that this was asked for after it.
                 return
             assert answer["result"], answer["values"]

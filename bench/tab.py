@@ -10,7 +10,6 @@ import contextlib
 import itertools
 import json
 import os
-import shutil
 import signal
 import subprocess
 import tempfile
@@ -19,12 +18,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from switchboard_drive import Drive
-from switchboard_waiting import wait_for
 from websockets.sync.client import ClientConnection, connect
 
 import relay_server
 from bench.report import Unavailable
+from tests.worlds.browser import chromium_path
+from tests.worlds.driving import Drive
+from tests.worlds.waiting import wait_for
 
 ARGUMENTS = ["--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-port=0"]
 TURN_LEFT = {"key": "a", "code": "KeyA", "windowsVirtualKeyCode": 65}
@@ -42,7 +42,7 @@ class Browser:
     """Chromium without a screen, and the connection that commands it."""
 
     def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
-        command = [shutil.which("chromium") or "", *ARGUMENTS, f"--user-data-dir={folder}", "about:blank"]
+        command = [chromium_path() or "", *ARGUMENTS, f"--user-data-dir={folder}", "about:blank"]
         self._process = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
         )
@@ -107,8 +107,8 @@ class Tab:
 
         :raises Unavailable: there is no Chromium, or no portal to open
         """
-        if shutil.which("chromium") is None:
-            raise Unavailable("no Chromium (Debian: apt install chromium)")
+        if chromium_path() is None:
+            raise Unavailable("no Chromium (Debian: apt install chromium-headless-shell)")
         if not (relay_server.PORTAL / "index.html").is_file():
             raise Unavailable("the portal is not built (make web)")
         with (

@@ -8,21 +8,20 @@ page shows in that of the page, by the same machine's clock.
 from __future__ import annotations
 
 import contextlib
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from playwright.sync_api import Page, expect
-from switchboard_browser import chromium, ready_to_drive, seen
-from switchboard_robot import Robot
-from switchboard_touch import LEVEL, OBEYED_SECONDS, Phone
-from switchboard_waiting import wait_for
 
 import relay_server
 from bench.driving import first_move
 from bench.relay import Relay
 from bench.report import Unavailable
+from tests.worlds.browser import chromium, chromium_path, ready_to_drive, seen
+from tests.worlds.robot_process import Robot
+from tests.worlds.touch import LEVEL, OBEYED_SECONDS, Phone
+from tests.worlds.waiting import wait_for
 
 PHONE: dict[str, Any] = {
     "viewport": {"width": 390, "height": 844},
@@ -75,11 +74,11 @@ class Tilted:
         self._page = page
         self._robot = robot
         self.anew = 0
+        self._phone = Phone(page)
         ready_to_drive(page)
         page.evaluate(WATCH)
         seen(page, "input-tilt").tap()
         seen(page, "tilt-ask").tap()
-        self._phone = Phone(page)
 
     def tilt(self, by: float) -> tuple[float, float]:
         """Hold the button for a while, then tilt; milliseconds to the command, and to what the page shows.
@@ -127,8 +126,8 @@ def phone(relay: Relay, robot: Robot, user: str, password: str) -> Iterator[Tilt
 
     :raises Unavailable: there is no Chromium, or no portal to open
     """
-    if shutil.which("chromium") is None:
-        raise Unavailable("no Chromium (Debian: apt install chromium)")
+    if chromium_path() is None:
+        raise Unavailable("no Chromium (Debian: apt install chromium-headless-shell)")
     if not (relay_server.PORTAL / "index.html").is_file():
         raise Unavailable("the portal is not built (make web)")
     expect.set_options(timeout=PATIENCE_MS)

@@ -14,12 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
-from switchboard_processes import running
 
 import relay_server
 from bench.cpu import resident
 from bench.relay import Relay
 from bench.report import Options, Row
+from relay_protocol import limits
+from tests.worlds.processes import running
 
 BAR_KIB = 64.0
 FIRST = 4
@@ -54,7 +55,9 @@ def attacks() -> dict[str, bytes]:
     body = b"POST /api/v1/session HTTP/1.1\r\nHost: relay\r\nContent-Type: application/json\r\n"
     return {
         "half a request": b"GET / HTTP/1.1\r\nHost: relay\r\nX-Filler: " + b"a" * 15_000,
-        "half a body of 64 KiB": body + b"Content-Length: 65536\r\n\r\n" + b"a" * 65_000,
+        "a body that lacks its end": body
+        + f"Content-Length: {limits.HTTP_BODY}\r\n\r\n".encode()
+        + b"a" * (limits.HTTP_BODY - 500),
         "requests for a file of the portal": pipelined(largest_asset()),
         "requests for the API's description": pipelined("/api/openapi.json"),
         "requests for nothing": pipelined("/n"),
@@ -83,8 +86,11 @@ def feed(rest: dict[socket.socket, bytes]) -> None:
             rest[one] = left[one.send(left) :] if left else left
 
 
-def growth(relay: Relay, data: bytes, count: int) -> float:
-    """Bytes by which the relay's memory grows for each of so many connections, at its highest."""
+def growth(relay: Relay, data: bytes, count: int, seconds: float) -> float:
+    """Bytes by which the relay's memory grows for each of so many connections, at its highest.
+
+    :param seconds: how long the relay is watched after the last connection
+    """
     highest = before = resident(relay.pid)
     rest: dict[socket.socket, bytes] = {}
     try:
@@ -92,7 +98,7 @@ def growth(relay: Relay, data: bytes, count: int) -> float:
             rest[one] = data
             feed(rest)
             highest = max(highest, resident(relay.pid))
-        end = time.monotonic() + WATCHED_SECONDS
+        end = time.monotonic() + seconds
         while time.monotonic() < end:
             feed(rest)
             highest = max(highest, resident(relay.pid))
@@ -105,7 +111,7 @@ def growth(relay: Relay, data: bytes, count: int) -> float:
 
 def run(options: Options) -> list[Row]:
     """Each attack on a relay of its own, or one would use memory that another has left."""
-    count = int(options.pick(20, 200))
+    count, seconds = int(options.pick(4, 200)), options.pick(0.2, WATCHED_SECONDS)
     rows = []
     for what, data in attacks().items():
         with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
@@ -114,8 +120,8 @@ def run(options: Options) -> list[Row]:
             # What is loaded at the first request is loaded once.
             for path in ("/", "/api/openapi.json", "/n"):
                 httpx.get(f"http://127.0.0.1:{relay.http_port}{path}")
-            growth(relay, data, FIRST)
-            grown = growth(relay, data, count)
+            growth(relay, data, FIRST, seconds)
+            grown = growth(relay, data, count, seconds)
         row = Row("unproven", f"{what}, {count} connections", "KiB", grown / 1024, bar=BAR_KIB)
         print(f"    {what}: {row.ours:.1f} KiB", flush=True)
         rows.append(row)

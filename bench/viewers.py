@@ -10,14 +10,13 @@ import statistics
 import time
 from typing import NamedTuple
 
-from switchboard_waiting import wait_for
-
 from bench.cpu import measured
 from bench.native import Receivers
 from bench.report import Options, Row
 from bench.robot import RealRobot, real_robot, settle
 from bench.wire import handshake, text_frame
 from relay_protocol import jsontext
+from tests.worlds.waiting import wait_for
 
 SCAN = "sensor_msgs/msg/LaserScan"
 TOPIC = "/bench/scan"
@@ -56,8 +55,8 @@ def watched(robot: RealRobot, receivers: Receivers, seconds: float) -> Cost:
 
 def run(options: Options) -> list[Row]:
     """One viewer, fifty, in turn; medians."""
-    many = int(options.pick(5, 50))
-    seconds, rounds = options.pick(1, 7), int(options.pick(1, 4))
+    many = int(options.pick(2, 50))
+    seconds, rounds = options.pick(0.3, 7), int(options.pick(1, 4))
     costs: dict[int, list[Cost]] = {1: [], many: []}
     with real_robot([STREAM]) as robot, contextlib.ExitStack() as stack:
         relay = robot.relay

@@ -1,6 +1,6 @@
 """Plain ends of connections, all served by one loop in one thread, so that they add as little as possible.
 
-:class:`WebEnd` is a rosbridge client, :class:`PlainRobot` a robot that speaks the link of SPEC section 2,
+:class:`WebEnd` is a rosbridge client, :class:`PlainRobot` a robot that speaks the link of SPEC 2,
 :class:`TcpEnd` what stands behind a proxy that knows neither.
 """
 
@@ -190,7 +190,7 @@ class WebEnd(End):
 
 
 _COUNTED = (1, 5)
-"""Kinds of frames: a sample, a command (SPEC section 2.1)."""
+"""Kinds of frames: a sample, a command (SPEC 2.1)."""
 
 
 class _LinkEnd(End):
@@ -295,8 +295,8 @@ class PlainRobot:
             self._joining = True
             self.channel = _LinkEnd(self.loop, self._port, self._channel_message)
             self.channel.tell(link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"]))
-        elif message["op"] == "control":
-            control.tell(link.Done(id=message["id"]))
+        elif message["op"] == "control_grant":
+            control.tell(link.OrderResult(id=message["id"]))
         else:
             self._heard.append(message)
 
@@ -320,7 +320,9 @@ class PlainRobot:
         elif op == "get_type":
             text = self._texts.get(message["type"])
             if text is None:
-                channel.tell(link.Failed(what="get_type", ref=message["type"], reason="it is not known here"))
+                channel.tell(
+                    link.Failed(request="get_type", reference=message["type"], reason="it is not known here")
+                )
             else:
                 channel.tell(link.TypeDefinition(type=message["type"], text=text))
 

@@ -1,28 +1,30 @@
-"""Settings of one relay. Read once, by the composition root."""
+"""Settings of one relay. The composition root reads them once."""
 
 from __future__ import annotations
 
 import ipaddress
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from relay_protocol import limits
 from relay_protocol.errors import Invalid
+from relay_server.common.data_dir import SOCKET_NAME
 
 
 @dataclass(frozen=True)
 class ListenAddress:
-    """Where to listen: a host (name or address) and a TCP port, 0 for any free one."""
+    """Where to listen: a host (name or address) and a TCP port; port 0 takes any free one."""
 
     host: str
     port: int
 
     @classmethod
     def parse(cls, text: str) -> ListenAddress:
-        """``HOST:PORT``, with an IPv6 address in brackets.
+        """Parse ``HOST:PORT``, with an IPv6 address in brackets.
 
-        :raises Invalid: not of that form
+        :raises Invalid: it does not have that form
         """
         try:
             parts = urlsplit("//" + text)
@@ -31,12 +33,12 @@ class ListenAddress:
             port = None
             parts = urlsplit("//")
         if not parts.hostname or port is None or parts.path or parts.username:
-            raise Invalid(f"'{text}' is no address to listen on; write HOST:PORT, as in 127.0.0.1:9090")
+            raise Invalid(f"'{text}' is not an address to listen on; write HOST:PORT, as in 127.0.0.1:9090")
         return cls(parts.hostname, port)
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can reach it."""
+        """Whether only this machine can connect to it."""
         if self.host == "localhost":
             return True
         try:
@@ -51,13 +53,13 @@ class ListenAddress:
 
 @dataclass(frozen=True)
 class AlertSettings:
-    """What an operator can set of alerts.
+    """Settings of alerts.
 
-    :param webhook_networks: private networks, and those of the machine itself, that messages may go to
-    :param webhook_deny: further networks that messages may not go to
-    :param apprise_schemes: beginnings of apprise's URLs that users may have messages sent by
-    :param battery_low: charge, 0 to 1, at which an alert begins; 0 is never
-    :param battery_critical: charge at which it becomes worse
+    :param webhook_networks: private or local networks that messages may be sent to
+    :param webhook_deny: further networks that messages must not be sent to
+    :param apprise_schemes: schemes of Apprise URLs that users may have messages sent by
+    :param battery_low: charge, 0 to 1, at which a warning begins; 0 switches it off
+    :param battery_critical: charge, 0 to 1, at which it becomes an error
     """
 
     webhook_networks: tuple[str, ...] = ()
@@ -68,12 +70,90 @@ class AlertSettings:
 
 
 @dataclass(frozen=True)
+class OffloadSettings:
+    """Settings of functions.
+
+    :param processes: calls that run at a time
+    :param folder: of further functions: ``*.py``
+    :param robots: patterns of the functions that robots may run
+    :param scheduler: address of a Dask scheduler whose workers run the calls; empty: this machine does
+    :param tls: files of the scheduler's CA, of the relay's certificate and of its key
+    """
+
+    processes: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
+    folder: Path | None = None
+    robots: tuple[str, ...] = ("*",)
+    scheduler: str = ""
+    tls: tuple[str, str, str] = ("", "", "")
+
+
+@dataclass(frozen=True)
+class FileSettings:
+    """Settings of the files of robots. Sizes are bytes.
+
+    :param robot: files of one robot
+    :param realm: files of all robots of a realm
+    :param relay: files of all robots
+    :param reserve: what stays free on the relay's disk
+    :param storage: URL of an S3-compatible storage; empty: the data folder
+    """
+
+    robot: int = 10 * 10**9
+    realm: int = 50 * 10**9
+    relay: int = 100 * 10**9
+    reserve: int = 10**9
+    storage: str = ""
+
+
+@dataclass(frozen=True)
+class ClusterSettings:
+    """Settings of a relay that is one of a cluster.
+
+    :param bus: addresses of NATS servers
+    :param listen: where the other relays connect
+    :param host: the name or address at which they reach this relay
+    :param secret: that all relays of the cluster have
+    :param tls: whether the listener uses TLS, with the relay's certificate
+    :param group: relays of one group have the same address, so robots can't choose between them; empty: none
+    """
+
+    bus: tuple[str, ...]
+    listen: ListenAddress
+    host: str
+    secret: str = field(repr=False)
+    tls: bool = False
+    group: str = ""
+
+
+@dataclass(frozen=True)
+class WorkerSettings:
+    """Settings of a worker, from the process that starts all workers; see :mod:`relay_server.cluster.workers`.
+
+    :param number: from 1
+    :param count: of workers
+    :param http: descriptor of the listening socket for clients
+    :param robots: the same for robots
+    :param group: of :class:`ClusterSettings`
+    :param name: of the relay
+    :param parent: id of the process that starts them
+    """
+
+    number: int
+    count: int
+    http: int
+    robots: int
+    group: str
+    name: str
+    parent: int
+
+
+@dataclass(frozen=True)
 class RelaySettings:
-    """What an operator can set.
+    """Settings of the relay.
 
     :param data: folder of the embedded database, the local socket and the pid file
     :param database: SQLAlchemy URL
-    :param tls_cert: PEM chain; both it and ``tls_key``, or neither
+    :param tls_cert: PEM chain; given together with ``tls_key`` or not at all
     :param origins: further origins (``https://host[:port]``) whose pages may use cookies here
     :param heartbeat: seconds between pings on a robot link
     :param linger: seconds a channel stays open after its last client
@@ -81,20 +161,26 @@ class RelaySettings:
     :param driving_ping: seconds between pings to a client that is driving
     :param stall_limit: seconds a client may take nothing before it is cut
     :param refresh: seconds between looks at the database's revision counter
-    :param explicit_control: no command takes control of a robot: it is taken by asking for it
-    :param control_grace: seconds who has control has to answer a request, before an owner may take over
-    :param control_request: seconds who has control has to answer a request, before it lapses
-    :param control_idle: seconds without a command that moves, after which control is free again
-    :param recordings: bytes all recordings together may have
-    :param recordings_reserve: bytes of the disk they leave free
-    :param events_of_source: events that each source may have in the memory
-    :param events_kept: seconds after which the memory lets an event go
-    :param largest_message: bytes of the largest websocket message taken from a client that has logged in
-    :param largest_sample: bytes of the largest sample taken from a robot
-    :param requests: HTTP requests a second of one user, or of a network in which nobody is known; 0: as many as come
-    :param answer_seconds: seconds in which a request by HTTP is answered; 0: no limit
-    :param streams: streams that one user may have open; 0: as many as come
-    :param alerts: what people are told of, and where that may go
+    :param files: settings of the files of robots
+    :param explicit_control: no command takes control of a robot; a client has to ask for it
+    :param control_grace: seconds a holder of control has to answer a request, before an owner may take over
+    :param control_request: seconds a holder of control has to answer a request, before it lapses
+    :param control_idle: seconds without a command that moves the robot, after which control is released
+    :param recordings: bytes of all recordings together
+    :param recordings_reserve: bytes of the disk that recordings leave free
+    :param events_of_source: events stored of each source
+    :param events_kept: seconds for which events are stored
+    :param largest_message: bytes of the largest websocket message accepted from a client that has logged in
+    :param largest_sample: bytes of the largest sample accepted from a robot
+    :param requests: HTTP requests per second of one user, or of a network of unauthenticated clients; 0
+        for no limit
+    :param answer_seconds: seconds in which an HTTP request is answered; 0 for no limit
+    :param streams: streams that one user may have open; 0 for no limit
+    :param connections: that one network may have open, of clients and of robots each; 0 for no limit
+    :param alerts: settings of alerts
+    :param cluster: settings of a cluster; ``None``: this is the only relay
+    :param offload: settings of functions
+    :param worker: what it is as a worker; ``None``: it opens its ports itself
     """
 
     data: Path
@@ -111,9 +197,9 @@ class RelaySettings:
     driving_ping: float = 0.1
     stall_limit: float = 5.0
     refresh: float = 0.25
-    connections_per_address: int = 512
     recordings: int = 10 * 10**9
     recordings_reserve: int = 10**9
+    files: FileSettings = field(default_factory=FileSettings)
     explicit_control: bool = False
     control_grace: float = 30.0
     control_request: float = 60.0
@@ -125,22 +211,25 @@ class RelaySettings:
     requests: float = 500.0
     answer_seconds: float = 10.0
     streams: int = 128
+    connections: int = 512
     alerts: AlertSettings = field(default_factory=AlertSettings)
+    cluster: ClusterSettings | None = None
+    offload: OffloadSettings = field(default_factory=OffloadSettings)
+    worker: WorkerSettings | None = None
 
     @property
     def tls(self) -> bool:
-        """Whether both listeners speak TLS."""
+        """Whether both listeners use TLS."""
         return self.tls_cert is not None
 
     @property
     def scheme(self) -> str:
-        """``https`` with TLS, else ``http``."""
         return "https" if self.tls else "http"
 
     def url(self, port: int) -> str:
-        """Where people go: the first origin that was listed, else where the relay listens.
+        """The portal's address: the first listed origin, otherwise the address the relay listens on.
 
-        :param port: the one it listens on for HTTP
+        :param port: of HTTP
         """
         if self.origins:
             return self.origins[0].rstrip("/")
@@ -149,6 +238,18 @@ class RelaySettings:
         return f"{self.scheme}://{shown}:{port}"
 
     @property
+    def robots_host(self) -> str:
+        """The host that robots dial, or empty: that of the portal's address, otherwise that of a relay on loopback."""
+        if self.origins:
+            return urlsplit(self.origins[0]).hostname or ""
+        return self.robots.host if self.robots.loopback else ""
+
+    @property
+    def robots_tls(self) -> bool:
+        """Whether robots dial with TLS. A proxy that ends it for browsers does so for robots."""
+        return self.tls or (bool(self.origins) and self.origins[0].lower().startswith("https:"))
+
+    @property
     def socket_path(self) -> Path:
-        """The local socket the admin command line talks to."""
-        return self.data / "relay.sock"
+        """The local socket for the command line."""
+        return self.data / SOCKET_NAME

@@ -18,7 +18,7 @@ from twisted.python.failure import Failure
 
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.config import RelaySettings
-from relay_server.service import Relay
+from relay_server.relay import Relay
 
 STOP_SECONDS = 8.0
 _ENDING = (signal.SIGTERM, signal.SIGINT)
@@ -26,13 +26,14 @@ log = Logger()
 
 
 def run(
-    settings: RelaySettings, ready: Callable[[Relay, str | None], None], *, hangup_ends: bool = False
+    settings: RelaySettings, ready: Callable[[Relay, str | None], None], *, in_terminal: bool = False
 ) -> int:
     """Serve until SIGTERM or SIGINT.
 
-    :param ready: called once everything listens, with the first login link if nobody can log in yet
-    :param hangup_ends: whether SIGHUP ends it too; else it reads the TLS certificate again
-    :returns: exit code; 1 when it could not start, 3 when the database or folder can't be had; said on stderr
+    :param ready: called once everything listens, with the first login link if no user can log in yet
+    :param in_terminal: whether SIGHUP ends it too, which otherwise reloads the TLS certificate, and nothing is drained
+    :returns: exit code; 1 when it could not start, 3 when the database or folder is not available; stderr
+        says why
     """
     reactor = monotonic_reactor()
     try:
@@ -40,59 +41,86 @@ def run(
     except SwitchboardError as error:
         sys.stderr.write(f"switchboard: {error}\n")
         return _code_of(error)
-    failed: list[int] = []
-    stuck: list[str] = []
+    return _Process(reactor, relay, ready, in_terminal).run()
 
-    async def begin() -> None:
-        await relay.start()
-        # What is there by now stays. To look through all of it for garbage, every few seconds under load, took 90 ms.
-        gc.collect()
-        gc.freeze()
-        ready(relay, await relay.first_login())
 
-    def end() -> None:
-        leave(reactor)
+class _Process:
+    """A relay between its start and the end of the process."""
 
-    def wrong(failure: Failure) -> None:
-        sys.stderr.write(f"switchboard: {_sentence(failure)}\n")
-        failed.append(_code_of(failure.value))
-        end()
+    def __init__(
+        self,
+        reactor: Any,
+        relay: Relay,
+        ready: Callable[[Relay, str | None], None],
+        in_terminal: bool,
+    ) -> None:
+        self._reactor = reactor
+        self._relay = relay
+        self._ready = ready
+        self._in_terminal = in_terminal
+        self._exit_code = 0
+        self._leaving = False
+        self._unfinished = ""
+        """Why the relay did not stop in time; empty if it did."""
 
-    def unfinished(failure: Failure) -> None:
-        timed_out = failure.check(TimeoutError)
-        stuck.append(f"no answer within {STOP_SECONDS:g} s" if timed_out else failure.getErrorMessage())
+    def run(self) -> int:
+        """Run the reactor until it stops; returns the exit code."""
+        self._reactor.callWhenRunning(self._start)
+        self._reactor.addSystemEventTrigger("before", "shutdown", self._stop)
+        on_hangup = self._leave if self._in_terminal else self._relay.reload_tls
+        signal.signal(signal.SIGHUP, lambda *_: self._reactor.callFromThread(on_hangup))
+        self._reactor.run()
+        if self._unfinished:
+            # Threads that wait for a hanging database would keep the process running.
+            log.error("leaving with the database unfinished: {reason}", reason=self._unfinished)
+            sys.stdout.flush()
+            os._exit(self._exit_code)
+        return self._exit_code
 
-    def stopping() -> Deferred[Any]:
-        # Until the process is gone: at its very end Python would let them kill it.
-        for number in _ENDING:
-            signal.signal(number, signal.SIG_IGN)
-        done = Deferred.fromCoroutine(relay.stop()).addTimeout(STOP_SECONDS, reactor)
-        return done.addErrback(unfinished)
-
-    def start() -> None:
-        # In place of Twisted's, which log a traceback when a second one comes. A job in the background may have been
-        # started to ignore Ctrl-C.
+    def _start(self) -> None:
+        # In place of Twisted's handlers, which log a traceback at a second signal. A background job may have
+        # been started to ignore Ctrl-C.
         for number in _ENDING:
             if signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, lambda *_: reactor.callFromThread(end))
-        Deferred.fromCoroutine(begin()).addErrback(wrong)
+                signal.signal(number, lambda *_: self._reactor.callFromThread(self._leave))
+        Deferred.fromCoroutine(self._begin()).addErrback(self._failed)
 
-    reactor.callWhenRunning(start)
-    reactor.addSystemEventTrigger("before", "shutdown", stopping)
-    on_hangup = end if hangup_ends else relay.reload_tls
-    signal.signal(signal.SIGHUP, lambda *_: reactor.callFromThread(on_hangup))
-    reactor.run()
-    code = failed[0] if failed else 0
-    if stuck:
-        # Threads that wait for a database that hangs would keep the process for as long as it does.
-        log.error("leaving with the database unfinished: {reason}", reason=stuck[0])
-        sys.stdout.flush()
-        os._exit(code)
-    return code
+    async def _begin(self) -> None:
+        await self._relay.start()
+        # Objects that exist now stay. Collecting garbage among them took 90 ms every few seconds under load.
+        gc.collect()
+        gc.freeze()
+        self._ready(self._relay, await self._relay.first_login())
+
+    def _failed(self, failure: Failure) -> None:
+        sys.stderr.write(f"switchboard: {_sentence(failure)}\n")
+        self._exit_code = self._exit_code or _code_of(failure.value)
+        self._leave()
+
+    def _leave(self) -> None:
+        """Stop, after a drain; at the second signal at once."""
+        if self._leaving or self._exit_code or self._in_terminal:
+            leave(self._reactor)
+            return
+        self._leaving = True
+        drained = Deferred.fromCoroutine(self._relay.drain())
+        drained.addErrback(lambda failure: log.failure("the drain failed", failure))
+        drained.addBoth(lambda _: leave(self._reactor))
+
+    def _stop(self) -> Deferred[Any]:
+        # Until the process is gone: at its very end Python would let the signals kill it.
+        for number in _ENDING:
+            signal.signal(number, signal.SIG_IGN)
+        done = Deferred.fromCoroutine(self._relay.stop()).addTimeout(STOP_SECONDS, self._reactor)
+        return done.addErrback(self._stopped_late)
+
+    def _stopped_late(self, failure: Failure) -> None:
+        timed_out = failure.check(TimeoutError)
+        self._unfinished = f"no answer within {STOP_SECONDS:g} s" if timed_out else failure.getErrorMessage()
 
 
 def leave(reactor: Any) -> None:
-    """Stop the reactor; once it stops, nothing more comes of this."""
+    """Stop the reactor, unless it is stopping already."""
     with suppress(ReactorNotRunning):
         reactor.stop()
 
@@ -102,7 +130,7 @@ def _code_of(error: BaseException | None) -> int:
 
 
 def monotonic_reactor() -> Any:
-    """Twisted's reactor on the monotonic clock: its own, the wall clock, jumps when NTP sets it."""
+    """Twisted's reactor with the monotonic clock. Its default, the wall clock, jumps when NTP sets it."""
     from twisted.internet import reactor
 
     monotonic: Any = reactor
@@ -114,9 +142,9 @@ def _sentence(failure: Failure) -> str:
     error = failure.value
     if isinstance(error, CannotListenError):
         reason = getattr(error.socketError, "strerror", None) or str(error.socketError)
-        return f"can't listen on {error.interface or 'any address'} port {error.port}: {reason}"
+        return f"cannot listen on {error.interface or 'any address'} port {error.port}: {reason}"
     if isinstance(error, SwitchboardError):
         return str(error)
     if isinstance(error, OSError):
-        return f"it can't start: {error.strerror or error}{f': {error.filename}' if error.filename else ''}"
-    return f"it failed to start: {failure.getTraceback()}"
+        return f"cannot start: {error.strerror or error}{f': {error.filename}' if error.filename else ''}"
+    return f"failed to start: {failure.getTraceback()}"

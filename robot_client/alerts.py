@@ -1,4 +1,4 @@
-"""How parts of the daemon tell a person something."""
+"""Alerts for people: raised by parts of the daemon, sent to the relay until it has received them."""
 
 from __future__ import annotations
 
@@ -8,161 +8,162 @@ from typing import NamedTuple, Protocol
 
 from relay_protocol import link
 
-HEARING_NS = 5_000_000_000
-"""A daemon has so long to hear what is wrong before it says that it has told all: diagnostics come once a second."""
+STARTUP_NS = 5_000_000_000
+"""Nanoseconds after its start in which a daemon finds faults; diagnostics come once a second. Only then does it notify
+the relay that its report is complete."""
 
-KEPT = 300
-"""Most alerts that are remembered while they last, and most words that may have to be said again."""
+MAX_ALERTS = 300
+"""Most active alerts that are remembered, and most messages that may have to be sent again."""
+
+MODULE = "module"
+"""Kind of alerts about the daemon's own parts."""
+
+CONTROL = "control"
+"""Kind of alerts about control. Without a part it is a single event, such as a loss of control during
+motion. It never ends, and is not repeated once it has arrived."""
 
 
 class OnAlert(Protocol):
-    """Who is told."""
+    """A receiver of alerts."""
 
     def __call__(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
-        """Something a person should know (SPEC section 2.4, ``alert``).
+        """Report a fault or an event to people (SPEC 2.4, ``alert``).
 
         :param level: ``info``, ``warning`` or ``error``
         :param kind: ``module``, ``diagnostics``, …
         :param about: the part of the robot
-        :param over: what was told under this kind and part is well again
+        :param over: whether the alert of this kind and part has ended
         """
 
 
-def nobody(level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
-    """Nobody is there to be told."""
+def ignore_alert(level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+    """An :class:`OnAlert` that does nothing."""
 
 
 class AlertCondition:
-    """One thing that may be wrong for a while: a person hears when it begins, when it is another, and when it is over.
+    """One condition that raises an alert when it begins or changes, and ends it when it is over.
 
-    :param alert: tells a person
-    :param kind: what it is about, as for :class:`OnAlert`
+    :param kind: as for :class:`OnAlert`
     :param about: the part of the robot
     """
 
     def __init__(self, alert: OnAlert, kind: str, about: str) -> None:
-        self.words = ""
-        """What was told and lasts; empty for nothing."""
+        self.text = ""
+        """Text of the alert while the condition lasts, else empty."""
         self._alert = alert
         self._kind = kind
         self._about = about
 
-    def tell(self, words: str, well: str) -> None:
-        """Tell what is wrong now, if that is news.
+    def update(self, text: str, resolved: str) -> None:
+        """Set the condition; an alert is sent only if it changed.
 
-        :param words: empty for nothing
-        :param well: what is said of it when it is over
+        :param text: describes the fault; empty if there is none
+        :param resolved: text to send when the condition ends
         """
-        told, self.words = self.words, words
-        if words and words != told:
-            self._alert("error", words, self._kind, self._about)
-        elif told and not words:
-            self._alert("info", well, self._kind, self._about, over=True)
+        before, self.text = self.text, text
+        if text and text != before:
+            self._alert("error", text, self._kind, self._about)
+        elif before and not text:
+            self._alert("info", resolved, self._kind, self._about, over=True)
 
 
-MODULE = "module"
-"""Kind of what is told of the daemon's own parts."""
-
-CONTROL = "control"
-"""Kind of a loss of control while the robot moved. Of no part it has happened and does not last: once heard it is told
-no more."""
-
-
-class Reach(Protocol):
-    """What is asked of the control link."""
+class AlertLink(Protocol):
+    """The control link, as far as alerts need it."""
 
     @property
     def registered(self) -> bool:
-        """Whether the relay knows us now."""
+        """Whether the robot is registered now."""
 
     @property
     def answered(self) -> int | None:
         """When the latest ping that the relay has answered was sent, nanoseconds."""
 
-    def say(self, message: link.Message) -> None:
+    def send(self, message: link.Message) -> None:
         """Send a message."""
 
 
-class _Word(NamedTuple):
-    """Something that was told, and when it was said into a link, nanoseconds; ``None``: not yet."""
+class _UnconfirmedAlert(NamedTuple):
+    """An alert that may not have arrived; ``sent_at`` in nanoseconds, ``None`` if it was not sent yet."""
 
     message: link.Alert
-    said: int | None
+    sent_at: int | None
 
 
-class AlertMemory:
-    """Tells the relay, and at each registration again what lasts and what the relay may not have heard.
+class AlertReporter:
+    """Sends alerts to the relay. At each registration it sends those again that are active or may not have arrived.
 
-    A link may be dead for seconds before that is known. What was said before a ping that was answered has arrived.
+    A dead link is noticed only after seconds. An alert has arrived if a ping that was sent after it was
+    answered.
 
-    :param now: the clock of ``reach.answered``, nanoseconds
+    :param now: the clock of :attr:`AlertLink.answered`, nanoseconds
     """
 
-    def __init__(self, reach: Reach, now: Callable[[], int]) -> None:
-        self._reach = reach
+    def __init__(self, control_link: AlertLink, now: Callable[[], int]) -> None:
+        self._link = control_link
         self._now = now
-        self._lasting: dict[tuple[str, str], link.Alert] = {}
-        self._doubtful: deque[_Word] = deque(maxlen=KEPT)
-        self._began = now()
-        self._owes = False
-        """Whether the relay is still to be told, in this registration, that this was all."""
-        self._whole = True
-        """Whether all that lasts is remembered."""
+        self._active: dict[tuple[str, str], link.Alert] = {}
+        self._unconfirmed: deque[_UnconfirmedAlert] = deque(maxlen=MAX_ALERTS)
+        self._started = now()
+        self._completion_due = False
+        """Whether the relay is still to be notified, for this registration, that the report is complete."""
+        self._remembers_all = True
+        """Whether all active alerts are in :attr:`_active`."""
 
-    def tell(self, message: link.Alert) -> None:
-        """Say it now if the relay is there, and later if it was not."""
-        self._forget()
+    def report(self, message: link.Alert) -> None:
+        """Send an alert now, or at the next registration if there is no link."""
+        self._forget_confirmed()
         if message.kind and (message.kind, message.about) != (CONTROL, ""):
             self._remember(message)
-        registered = self._reach.registered
-        self._doubtful.append(_Word(message, self._now() if registered else None))
+        registered = self._link.registered
+        self._unconfirmed.append(_UnconfirmedAlert(message, self._now() if registered else None))
         if registered:
-            self._reach.say(message)
+            self._link.send(message)
 
-    def look(self) -> None:
-        """Forget what has arrived, and say what is due; to be called now and then."""
-        self._forget()
-        self._say_that_is_all()
-
-    def _forget(self) -> None:
-        answered = self._reach.answered
-        while answered is not None and self._doubtful:
-            said = self._doubtful[0].said
-            if said is None or said >= answered:
-                return
-            self._doubtful.popleft()
+    def flush(self) -> None:
+        """Forget alerts that have arrived, and end the report if that is due; to be called every few seconds."""
+        self._forget_confirmed()
+        self._send_completion()
 
     def registered(self) -> None:
-        """The relay knows us again, or another one does: tell all that lasts (SPEC section 2.4, ``alerts_told``)."""
-        doubtful = [each.message for each in self._doubtful]
-        lasting = [each for each in self._lasting.values() if each not in doubtful]
-        self._doubtful.clear()
-        for message in (*lasting, *doubtful):
-            self._doubtful.append(_Word(message, self._now()))
-            self._reach.say(message)
-        self._owes = self._whole
-        self._say_that_is_all()
+        """Report everything again, since the relay may be another one (SPEC 2.4,
+        ``active_alerts_sent``)."""
+        unconfirmed = [each.message for each in self._unconfirmed]
+        active = [each for each in self._active.values() if each not in unconfirmed]
+        self._unconfirmed.clear()
+        for message in (*active, *unconfirmed):
+            self._unconfirmed.append(_UnconfirmedAlert(message, self._now()))
+            self._link.send(message)
+        self._completion_due = self._remembers_all
+        self._send_completion()
 
-    def _say_that_is_all(self) -> None:
-        """Not before what is wrong can have been heard: what is not told by then is over for the relay."""
-        heard = self._now() - self._began >= HEARING_NS
-        if self._owes and heard and self._reach.registered:
-            self._owes = False
-            self._reach.say(link.AlertsTold())
+    def _forget_confirmed(self) -> None:
+        answered = self._link.answered
+        while answered is not None and self._unconfirmed:
+            sent_at = self._unconfirmed[0].sent_at
+            if sent_at is None or sent_at >= answered:
+                return
+            self._unconfirmed.popleft()
+
+    def _send_completion(self) -> None:
+        """The relay ends all alerts that were not reported by then, so not before :data:`STARTUP_NS`."""
+        started = self._now() - self._started >= STARTUP_NS
+        if self._completion_due and started and self._link.registered:
+            self._completion_due = False
+            self._link.send(link.ActiveAlertsSent())
 
     def _remember(self, message: link.Alert) -> None:
         key = (message.kind, message.about)
         if message.over:
-            self._lasting.pop(key, None)
-            self._whole = self._whole or not self._lasting
-            # Who heard that it began and that it is over must not hear again that it began.
-            rest = [each for each in self._doubtful if each.said is None or not _same(each.message, message)]
-            self._doubtful = deque(rest, KEPT)
-        elif key in self._lasting or len(self._lasting) < KEPT:
-            self._lasting[key] = message
+            self._active.pop(key, None)
+            self._remembers_all = self._remembers_all or not self._active
+            # After the end has been sent, the beginning must not be sent again.
+            remaining = [
+                each
+                for each in self._unconfirmed
+                if each.sent_at is None or (each.message.kind, each.message.about) != key
+            ]
+            self._unconfirmed = deque(remaining, MAX_ALERTS)
+        elif key in self._active or len(self._active) < MAX_ALERTS:
+            self._active[key] = message
         else:
-            self._whole = False
-
-
-def _same(one: link.Alert, other: link.Alert) -> bool:
-    return (one.kind, one.about) == (other.kind, other.about)
+            self._remembers_all = False

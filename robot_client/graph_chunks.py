@@ -1,4 +1,4 @@
-"""A graph in messages that fit into frames of the control link (SPEC section 2.4)."""
+"""Splits a graph into messages that fit into frames of the control link (SPEC 2.4)."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from typing import Any
 
 from relay_protocol import jsontext, limits, link
 
-_HEAD = 200
-"""Room for the frame's kind, ``op``, ``full`` and the names of the maps."""
+_OVERHEAD = 200
+"""Bytes for the frame's kind, ``op``, ``full`` and the names of the maps."""
 
 
-def parts(graph: link.Graph, limit: int = limits.CONTROL_FRAME) -> Iterator[link.Graph]:
-    """The same graph, or difference, as one message or several: the first as it was, then differences.
+def graph_chunks(graph: link.Graph, limit: int = limits.CONTROL_FRAME) -> Iterator[link.Graph]:
+    """A graph, full or changes, as one or several messages; those after the first are changes.
 
-    Names longer than ROS has are left out, ends beyond what the contract takes too.
+    Names that are longer than the protocol allows, and excess endpoints of a topic or service, are left out.
 
     :param limit: most bytes of a frame
     """
     maps: dict[str, dict[str, Any]] = {}
-    room, full = limit - _HEAD, graph.full
+    room, full = limit - _OVERHEAD, graph.full
     for kind, name, entry in _entries(graph):
         size = len(jsontext.encode(name)) + len(jsontext.encode(entry)) + 2
-        if size > limit - _HEAD:
+        if size > limit - _OVERHEAD:
             continue
         if size > room:
             yield link.Graph(full=full, **maps)
-            maps, room, full = {}, limit - _HEAD, False
+            maps, room, full = {}, limit - _OVERHEAD, False
         maps.setdefault(kind, {})[name] = entry
         room -= size
     yield link.Graph(full=full, **maps)
@@ -42,12 +42,14 @@ def _entries(graph: link.Graph) -> Iterator[tuple[str, str, Any]]:
 def _bounded(entry: Any) -> Any:
     if isinstance(entry, link.Topic):
         return link.Topic(
-            types=_few(entry.types), publishers=_few(entry.publishers), subscribers=_few(entry.subscribers)
+            types=_limited(entry.types),
+            publishers=_limited(entry.publishers),
+            subscribers=_limited(entry.subscribers),
         )
     if isinstance(entry, link.Service):
-        return link.Service(types=_few(entry.types), providers=_few(entry.providers))
+        return link.Service(types=_limited(entry.types), providers=_limited(entry.providers))
     return entry
 
 
-def _few(names: Iterable[str]) -> list[str]:
-    return [name for name in names if len(name) <= limits.NAME][: limits.GRAPH_ENDS]
+def _limited(names: Iterable[str]) -> list[str]:
+    return [name for name in names if len(name) <= limits.NAME][: limits.GRAPH_NODES]

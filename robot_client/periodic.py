@@ -1,4 +1,4 @@
-"""Work that goes on whatever fails in it: a failure is logged, and what comes after it is done all the same."""
+"""Steps and periodic tasks whose failures are logged and do not stop what follows."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from twisted.internet.task import LoopingCall
 from twisted.logger import Logger
 
 LOG_EVERY = 60.0
-"""Seconds between two failures of one round that are logged."""
+"""Seconds between two logged failures of one task."""
 
 
-def run_safely(log: Logger, what: str, step: Callable[..., object], *arguments: Any) -> None:
-    """Do a step on which what comes after it must not hang.
+def run_safely(log: Logger, message: str, step: Callable[..., object], *arguments: Any) -> None:
+    """Run a step; if it raises, log that and return.
 
-    :param what: the words to log if it fails
+    :param message: to log with the failure
     """
     try:
         step(*arguments)
     except Exception:
-        log.failure(what)
+        log.failure(message)
 
 
 class PeriodicTasks:
-    """Steps done again and again, each also after it has failed: a loop of Twisted's would end, without a word.
+    """Steps that are repeated, also after failures, which would end a :class:`LoopingCall`.
 
-    :param steps: what to do, and after how many seconds each time
+    :param steps: each step with its interval, seconds
     :param clock: for timers
     """
 
@@ -36,12 +36,12 @@ class PeriodicTasks:
             loop.clock = clock
 
     def start(self) -> None:
-        """Begin, with a pause."""
+        """Start; each step first runs after its interval."""
         for loop, every in self._loops:
             loop.start(every, now=False)
 
     def stop(self) -> None:
-        """Do them no more."""
+        """Stop all steps."""
         for loop, _ in self._loops:
             if loop.running:
                 loop.stop()
@@ -52,16 +52,16 @@ class _PeriodicTask:
         self._step = step
         self._every = every
         self._clock = clock
-        self._silent_until = clock.seconds()
-        self._log = Logger("rounds")
+        self._quiet_until = clock.seconds()
+        self._log = Logger("periodic")
 
     def __call__(self) -> None:
         try:
             self._step()
         except Exception:
             now = self._clock.seconds()
-            if now >= self._silent_until:
-                self._silent_until = now + LOG_EVERY
+            if now >= self._quiet_until:
+                self._quiet_until = now + LOG_EVERY
                 self._log.failure(
-                    "what is done every {every:g} s failed; it is tried again", every=self._every
+                    "a task that runs every {every:g} s failed; it continues", every=self._every
                 )

@@ -1,14 +1,19 @@
-"""The one place where the daemon is put together."""
+"""Builds the daemon with all its parts, starts and stops it: its composition root."""
 
 from __future__ import annotations
 
 import os
 import secrets
+import time
+from collections.abc import Callable
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from twisted.internet.defer import Deferred, DeferredList
+from twisted.internet.threads import deferToThread, deferToThreadPool
 from twisted.logger import Logger
+from twisted.python.threadpool import ThreadPool
 
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Unavailable
@@ -17,20 +22,32 @@ from robot_client.camera.service import DaemonCameras
 from robot_client.camera.supervisor import CameraSupervisor
 from robot_client.config import RobotSettings
 from robot_client.daemon import Daemon
+from robot_client.device_state.manager import DeviceManager
+from robot_client.device_state.readings import DeviceReadings
+from robot_client.files.confirmed import ConfirmedFiles
+from robot_client.files.uploader import FileUploader
+from robot_client.link.addresses import RelayAddresses
 from robot_client.link.backoff import Backoff
-from robot_client.link.connection import ControlConnection
-from robot_client.link.identity import Enrolment
-from robot_client.link.protocol import ControlLink, Identity
+from robot_client.link.control_connection import ControlConnection
+from robot_client.link.enrolment import Enrolment
+from robot_client.link.links import ControlLink, Identity
 from robot_client.link.tls import endpoint, split_address
+from robot_client.modules.local_orders import LocalOrderServer
+from robot_client.modules.processes import boot_id
+from robot_client.modules.relay_requests import ModuleRequests
+from robot_client.modules.supervisor import ModuleSupervisor
 from robot_client.motion.guard_port import NoGuard
 from robot_client.motion.guard_supervisor import GuardSupervisor
 from robot_client.motion.hardware import Hardware
 from robot_client.motion.stop_store import StopStore
+from robot_client.offload.device import STATE_VARIABLE
+from robot_client.periodic import run_safely
 from robot_client.platforms.base import Platform
 from robot_client.systemd import Notifier
 from robot_client.twisted_types import DialEndpoint
 
-LEAVE_SECONDS = 4.0
+SHUTDOWN_SECONDS = 4.0
+"""Longest time from :meth:`DaemonProcess.stop` until the platform is stopped."""
 
 
 def agent() -> str:
@@ -41,10 +58,179 @@ def agent() -> str:
         return "switchboard-robot"
 
 
-def make_ros(reactor: Any, settings: RobotSettings, suffix: str) -> Platform:
+FILE_THREADS = 2
+"""Threads that read and hash files."""
+
+
+class DaemonProcess:
+    """The daemon with all its parts: platform, guard, cameras, modules.
+
+    :param reactor: its clock must be monotonic
+    :param stop_store: stores a stop for the next start
+    :param modules: folder of the modules' logs and runs
+    :param platform: ``None`` for ROS 2
+    """
+
+    def __init__(
+        self,
+        reactor: Any,
+        settings: RobotSettings,
+        enrolment: Enrolment,
+        identity: Identity,
+        stop_store: StopStore,
+        modules: Path,
+        platform: Platform | None = None,
+    ) -> None:
+        suffix = secrets.token_hex(3)
+        self.reactor = reactor
+        self._enrolment = enrolment
+        self._addresses = RelayAddresses(enrolment.address)
+        self._file_threads = ThreadPool(1, FILE_THREADS, "files")
+        self._log = Logger("daemon")
+        self.platform = platform or build_ros_platform(reactor, settings, suffix)
+        self.guard = build_guard(reactor, settings, suffix) if settings.safety.guard else None
+        self.cameras = build_cameras(reactor, settings, enrolment, suffix)
+        connection = self._build_connection(identity)
+        self.modules = self._build_modules(settings, modules)
+        self._local_orders = LocalOrderServer(self.modules, modules)
+        self.device = DeviceManager(
+            settings.offload,
+            DeviceReadings(modules.parent, self.platform.battery),
+            modules.parent,
+            send=connection.send,
+            alert=self._alert,
+        )
+        requests = ModuleRequests(
+            self.modules,
+            modules,
+            send=connection.send,
+            clock=reactor,
+            in_thread=lambda *work: deferToThreadPool(reactor, reactor.getThreadPool(), *work),
+            other_roots=self._process_roots,
+            wall=time.time,
+        )
+        self.daemon = Daemon(
+            settings=settings,
+            connection=connection,
+            platform=self.platform,
+            guard=self.guard or NoGuard(),
+            cameras=self._build_cameras(settings, connection),
+            modules=requests,
+            files=self._build_files(settings, modules.parent, connection),
+            device=self.device,
+            stop_store=stop_store,
+            hardware=Hardware(settings.safety.switches, self.platform, reactor),
+            clock=reactor,
+            dial=self._dial,
+            agent=agent(),
+        )
+        self._notifier = Notifier(reactor, os.environ, lambda: self.platform.fault() is None)
+
+    def start(self, before_modules: Callable[[], object] = lambda: None) -> None:
+        """Start everything.
+
+        :param before_modules: called before the first module is taken over or started
+        :raises Unavailable: the platform can't start
+        """
+        self.platform.start()
+        self.cameras.on_alert = self.platform.on_alert = self.daemon.alert
+        if self.guard is not None:
+            self.guard.on_alert = self.daemon.alert
+            self.guard.start()
+        self._file_threads.start()
+        run_safely(self._log, "the robot's computer can't be measured", self.device.measure)
+        self.daemon.start()
+        before_modules()
+        run_safely(self._log, "the modules can't be started", self.modules.start)
+        self._local_orders.start(self.reactor)
+        self._notifier.start()
+
+    def stop(self) -> Deferred[Any]:
+        """Stop the robot and everything else, within :data:`SHUTDOWN_SECONDS` even if a part hangs."""
+        self._log.info("shutting down")
+        self._notifier.stop()
+        stopping: list[Deferred[Any]] = [self.daemon.stop(), self.cameras.stop(), self.modules.stop()]
+        stopping.append(self._local_orders.stop())
+        if self.guard is not None:
+            # The guard runs until the last zero is published, then cancels the remaining goals.
+            stop_guard = self.guard.stop
+            stopping.append(self.daemon.motion_ended().addCallback(lambda _: stop_guard()))
+        stopped = DeferredList(stopping, consumeErrors=True)
+        stopped.addTimeout(SHUTDOWN_SECONDS, self.reactor)
+        stopped.addBoth(lambda _: deferToThread(self._file_threads.stop))
+        return stopped.addBoth(lambda _: self.platform.stop())
+
+    def _alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+        self.daemon.alert(level, text, kind, about, over)
+
+    def _process_roots(self) -> dict[int, str]:
+        roots = {os.getpid(): "daemon"}
+        for part, pid in (
+            ("guard", None if self.guard is None else self.guard.pid),
+            ("camera", self.cameras.pid),
+        ):
+            if pid is not None:
+                roots[pid] = part
+        return roots
+
+    def _build_connection(self, identity: Identity) -> ControlConnection:
+        return ControlConnection(
+            dial=self._dial,
+            build_link=lambda: ControlLink(identity, agent(), now_ns),
+            clock=self.reactor,
+            backoff=Backoff(secrets.SystemRandom().random),
+            robot=identity.robot,
+            addresses=self._addresses,
+        )
+
+    def _build_modules(self, settings: RobotSettings, folder: Path) -> ModuleSupervisor:
+        return ModuleSupervisor(
+            settings.module,
+            folder,
+            reactor=self.reactor,
+            # Programs find the robot's key and the state of its computer there (robot_client.offload).
+            environment={**os.environ, STATE_VARIABLE: str(folder.parent.absolute())},
+            graph=self.platform,
+            alert=self._alert,
+            boot=boot_id(),
+        )
+
+    def _build_cameras(self, settings: RobotSettings, connection: ControlConnection) -> DaemonCameras:
+        return DaemonCameras(
+            settings.cameras,
+            self.cameras,
+            connection.send,
+            self.reactor,
+            address=lambda: self._addresses.current,
+        )
+
+    def _build_files(
+        self, settings: RobotSettings, state: Path, connection: ControlConnection
+    ) -> FileUploader:
+        return FileUploader(
+            settings.file_group,
+            ConfirmedFiles(state / "confirmed-files.db"),
+            send=connection.send,
+            dial=self._dial,
+            clock=self.reactor,
+            in_thread=lambda *work: deferToThreadPool(self.reactor, self._file_threads, *work),
+            full=lambda: self.device.full,
+            now=now_ns,
+            alert=self._alert,
+        )
+
+    def _dial(self, address: str) -> DialEndpoint:
+        own = self._enrolment
+        host, port = split_address(address or self._addresses.current)
+        return endpoint(self.reactor, host, port, own.tls, own.ca, own.server_name)
+
+
+def build_ros_platform(reactor: Any, settings: RobotSettings, suffix: str) -> Platform:
     """The ROS 2 platform.
 
-    :raises Unavailable: there is no rclpy
+    :param suffix: ends the names of this run's nodes, so that DDS does not take them for those of an
+        earlier run
+    :raises Unavailable: rclpy is not installed
     """
     try:
         from robot_client.platforms.ros2.platform import Ros2Platform
@@ -63,102 +249,32 @@ def make_ros(reactor: Any, settings: RobotSettings, suffix: str) -> Platform:
     )
 
 
-class Runner:
-    """One run of the daemon.
+def build_guard(reactor: Any, settings: RobotSettings, suffix: str) -> GuardSupervisor:
+    """The supervisor of the guard process."""
+    safety = settings.safety
+    return GuardSupervisor(
+        reactor,
+        f"switchboard_guard_{suffix}",
+        safety.stop_within_ms,
+        settings.ros.use_sim_time,
+        {each.name: safety.times(each.name).stop_within_ms for each in safety.topic},
+    )
 
-    :param reactor: its clock must be monotonic
-    :param latch: where a stop is kept
-    """
 
-    def __init__(
-        self,
-        reactor: Any,
-        settings: RobotSettings,
-        enrolment: Enrolment,
-        me: Identity,
-        latch: StopStore,
-        platform: Platform | None = None,
-    ) -> None:
-        suffix = secrets.token_hex(3)
-        self.reactor = reactor
-        self.platform = platform or make_ros(reactor, settings, suffix)
-        self.keeper: GuardSupervisor | None = None
-        if settings.safety.guard:
-            self.keeper = GuardSupervisor(
-                reactor,
-                f"switchboard_guard_{suffix}",
-                settings.safety.stop_within_ms,
-                settings.ros.use_sim_time,
-                {
-                    each.name: settings.safety.times(each.name).stop_within_ms
-                    for each in settings.safety.topic
-                },
-            )
-        self.cameras = CameraSupervisor(
-            reactor,
-            CameraSettings(
-                address=enrolment.address,
-                tls=enrolment.tls,
-                ca=enrolment.ca,
-                server_name=enrolment.server_name,
-                # Begins like the daemon's own, so that the graph is told without it.
-                node=f"switchboard_{suffix}_camera",
-                streams=settings.video.streams,
-                target=settings.video.target_ms / 1000,
-            ),
-        )
-        self._enrolment = enrolment
-        connection = ControlConnection(
-            self._dial,
-            lambda: ControlLink(me, agent(), now_ns),
-            reactor,
-            Backoff(secrets.SystemRandom().random),
-            me.robot,
-            enrolment.address,
-        )
-        self.daemon = Daemon(
-            settings,
-            connection,
-            self.platform,
-            self.keeper or NoGuard(),
-            DaemonCameras(settings.cameras, self.cameras, connection.say, reactor),
-            latch,
-            Hardware(settings.safety.switches, self.platform, reactor),
-            reactor,
-            self._dial,
-            agent(),
-            now_ns,
-        )
-        self._notifier = Notifier(reactor, os.environ, lambda: self.platform.trouble() is None)
-        self._log = Logger("daemon")
-
-    def start(self) -> None:
-        """Begin.
-
-        :raises Unavailable: the platform can't start
-        """
-        self.platform.start()
-        self.cameras.on_alert = self.platform.on_alert = self.daemon.alert
-        if self.keeper is not None:
-            self.keeper.on_alert = self.daemon.alert
-            self.keeper.start()
-        self.daemon.start()
-        self._notifier.start()
-
-    def stop(self) -> Deferred[Any]:
-        """Stop the robot and leave, within seconds whatever hangs."""
-        self._log.info("leaving")
-        self._notifier.stop()
-        leaving: list[Deferred[Any]] = [self.daemon.stop(), self.cameras.stop()]
-        if self.keeper is not None:
-            # It watches until the last zero is said, and ends the goals that are left then.
-            leave = self.keeper.stop
-            leaving.append(self.daemon.settled().addCallback(lambda _: leave()))
-        gone = DeferredList(leaving, consumeErrors=True)
-        gone.addTimeout(LEAVE_SECONDS, self.reactor)
-        return gone.addBoth(lambda _: self.platform.stop())
-
-    def _dial(self, address: str) -> DialEndpoint:
-        host, port = split_address(address or self._enrolment.address)
-        own = self._enrolment
-        return endpoint(self.reactor, host, port, own.tls, own.ca, own.server_name)
+def build_cameras(
+    reactor: Any, settings: RobotSettings, enrolment: Enrolment, suffix: str
+) -> CameraSupervisor:
+    """The supervisor of the camera process."""
+    return CameraSupervisor(
+        reactor,
+        CameraSettings(
+            address=RelayAddresses(enrolment.address).current,
+            tls=enrolment.tls,
+            ca=enrolment.ca,
+            server_name=enrolment.server_name,
+            # Starts like the name of the daemon's node, so that it is left out of the graph too.
+            node=f"switchboard_{suffix}_camera",
+            streams=settings.video.max_streams,
+            target=settings.video.target_delay_ms / 1000,
+        ),
+    )

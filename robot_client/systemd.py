@@ -1,4 +1,4 @@
-"""Signs of life for systemd (``sd_notify(3)``): ready, alive, leaving."""
+"""Notifications to systemd (``sd_notify(3)``): ready, watchdog, stopping."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from twisted.internet.task import LoopingCall
 
 
 class Notifier:
-    """Tells systemd, if it asked to be told.
+    """Notifies systemd if it requested that.
 
     :param environment: with ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` from systemd
-    :param healthy: asked before each sign of life; without one systemd starts the daemon anew
+    :param healthy: called before each watchdog notification; without it systemd restarts the daemon
     """
 
     def __init__(self, clock: Any, environment: Mapping[str, str], healthy: Callable[[], bool]) -> None:
@@ -22,30 +22,30 @@ class Notifier:
         usec = environment.get("WATCHDOG_USEC", "")
         self._every = int(usec) / 2_000_000 if usec.isdigit() else 0.0
         self._healthy = healthy
-        self._loop = LoopingCall(self._live)
+        self._loop = LoopingCall(self._notify_watchdog)
         self._loop.clock = clock
 
     def start(self) -> None:
-        """Ready."""
-        self._tell("READY=1")
+        """Notify that the daemon is ready."""
+        self._send("READY=1")
         if self._address and self._every:
             self._loop.start(self._every, now=False)
 
     def stop(self) -> None:
-        """Leaving."""
+        """Notify that the daemon is stopping."""
         if self._loop.running:
             self._loop.stop()
-        self._tell("STOPPING=1")
+        self._send("STOPPING=1")
 
-    def _live(self) -> None:
+    def _notify_watchdog(self) -> None:
         if self._healthy():
-            self._tell("WATCHDOG=1")
+            self._send("WATCHDOG=1")
 
-    def _tell(self, text: str) -> None:
+    def _send(self, text: str) -> None:
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as out:
             try:
                 out.sendto(text.encode(), self._address)
             except OSError:
-                return  # systemd does not listen; then it does not care
+                return  # systemd does not read its socket

@@ -1,4 +1,4 @@
-"""What we use of Twisted's reactor, as types: its interfaces are zope's, which type checkers can't read."""
+"""Protocols for the used parts of Twisted's reactor; type checkers can't read its zope interfaces."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from twisted.internet.protocol import Factory
 
 
 class DelayedCall(Protocol):
-    """A call to come."""
+    """See :class:`twisted.internet.interfaces.IDelayedCall`."""
 
     def active(self) -> bool:
-        """Whether it is still to come."""
+        """Whether it has neither run nor been cancelled."""
 
     def cancel(self) -> None:
-        """Let it not come."""
+        """Cancel it."""
 
     def getTime(self) -> float:
-        """When it comes, on the clock's seconds."""
+        """When it runs, on the clock, seconds."""
 
 
 class ReactorClock(Protocol):
     """A reactor, or :class:`twisted.internet.task.Clock`."""
 
     def seconds(self) -> float:
-        """The time; only differences mean anything."""
+        """Seconds since an arbitrary moment."""
 
     def callLater(self, delay: float, callable: Callable[..., Any], *args: Any) -> DelayedCall:
         """Call after ``delay`` seconds."""
 
 
 class DialEndpoint(Protocol):
-    """Where to dial."""
+    """A client endpoint."""
 
     def connect(self, factory: Factory[Any]) -> Deferred[Any]:
-        """Dial; fires with the protocol."""
+        """Connect; fires with the protocol."""
 
 
 def monotonic_reactor() -> Any:
-    """The reactor, on a clock that nobody can set: a watchdog must not wait for a clock put back an hour."""
+    """The reactor with a monotonic clock: a watchdog must not be delayed when the wall clock is set back."""
     from twisted.internet import reactor
 
     clock: Any = reactor

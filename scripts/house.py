@@ -1,11 +1,12 @@
-"""Count what makes the code hard to find one's way in, and fail when a count grows. Run by ``make house``.
+"""Count what makes code and documents hard to find one's way in, and fail when a count grows. Run by ``make house``.
 
-It reads the product's Python files as syntax trees; nothing is imported or run.
+It reads the product's Python files as syntax trees, and the documents as text; nothing is imported or run.
 """
 
 from __future__ import annotations
 
 import ast
+import itertools
 import re
 import statistics
 import sys
@@ -24,13 +25,18 @@ PACKAGES = {
 }
 
 LIMITS = {
-    "files in import circles": 16,
+    "files in import circles": 0,
     "class names that occur twice": 0,
-    "private names": 1,
-    "calls with an unpacked tuple": 65,
-    "lines of relay_server/service.py": 416,
+    "private names": 0,
+    "calls with an unpacked tuple": 0,
+    "lines of relay_server/relay.py": 200,
     "lines of a function, 90th percentile": 30,
-    "functions over 60 lines": 10,
+    "functions over 60 lines": 1,
+    "lines of README.md": 150,
+    "sentences over 30 words, per cent": 5,
+    "sentences that begin with Who or What": 0,
+    "lines of documents over 100 characters": 17,
+    "characters of the widest row of a table": 486,
 }
 """The most there may be of each. A change may lower them, never raise them."""
 
@@ -49,6 +55,20 @@ PRIVATE = frozenset({
 })
 # fmt: on
 """Words that name nothing in ROS, HTTP, OAuth or publish/subscribe; no class name ends in one of them."""
+
+GENERATED = "<!-- Written by scripts/"
+"""Pages that begin with this under their heading are written by programs, and not counted."""
+
+_FIGURES = re.compile(r"<!-- figures.*?<!-- end of figures -->", re.DOTALL)
+"""The part of a page that ``bench.page`` writes."""
+
+_NOT_PROSE = re.compile(r"^ *```.*?^ *```|<!--.*?-->|^#.*?$|^\*\*[\d.]+-\d+\*\* ", re.DOTALL | re.MULTILINE)
+"""Code, comments, headings, and the ids of rules of the specification."""
+
+_LINK = re.compile(r"!?\[([^\]]*)\](?:\([^)]*\)|\[[^\]]*\])")
+_BLOCK_END = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.)\s)|\|")
+_SENTENCE_END = re.compile(r"(?<=[.!?])[*_)]*\s+(?=[A-Z`\[(*\"“0-9])")
+_BARE_SUBJECT = re.compile(r"[*_]*(?:Who|What)(?:ever)?\b(?!.*\?[*_]*\Z)")
 
 SHARED_NAMES = {"relay_protocol"}
 """Packages whose classes are named after the protocol's own messages, and may share those names."""
@@ -149,14 +169,19 @@ def repeated_names(all_modules: list[Module]) -> list[str]:
 
 
 def private_names(all_modules: list[Module]) -> list[str]:
-    """Classes whose last word is in :data:`PRIVATE`."""
+    """Classes whose last word is in :data:`PRIVATE`; "Sent" names a message well as the end of a longer name."""
     words = re.compile(r"[A-Z][a-z0-9]*")
     found = []
     for module, node in classes(all_modules):
         last = words.findall(node.name)[-1:]
-        if last and (last[0] in PRIVATE or node.name.lstrip("_") in PRIVATE):
+        if last and (last[0] in PRIVATE - {"Sent"} or node.name.lstrip("_") in PRIVATE):
             found.append(f"{module.name}.{node.name}")
     return found
+
+
+def _is_unpacked(argument: ast.expr) -> bool:
+    """Whether an argument is an unpacked tuple. ``*args`` hands on what a function was given itself."""
+    return isinstance(argument, ast.Starred) and getattr(argument.value, "id", "") != "args"
 
 
 def unpacked_calls(all_modules: list[Module]) -> list[str]:
@@ -164,7 +189,7 @@ def unpacked_calls(all_modules: list[Module]) -> list[str]:
     found = []
     for module in all_modules:
         for node in ast.walk(module.tree):
-            if not isinstance(node, ast.Call) or not any(isinstance(each, ast.Starred) for each in node.args):
+            if not isinstance(node, ast.Call) or not any(map(_is_unpacked, node.args)):
                 continue
             called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
             if called[:1].isupper():
@@ -181,6 +206,54 @@ def function_lengths(all_modules: list[Module]) -> list[tuple[int, str]]:
                 lines = (node.end_lineno or node.lineno) - node.lineno + 1
                 found.append((lines, f"{module.path.relative_to(ROOT)}:{node.lineno} {node.name} ({lines})"))
     return found
+
+
+def documents() -> Iterator[tuple[Path, str]]:
+    """The README, the pages of ``docs`` without generated ones, and the specification of the protocol."""
+    pages = [folder.rglob("*.md") for folder in (ROOT / "docs", ROOT / "protocol/spec")]
+    for path in [ROOT / "README.md", *sorted(itertools.chain(*pages))]:
+        if path.exists() and GENERATED not in (text := path.read_text("utf-8")):
+            yield path, _FIGURES.sub(lambda part: "\n" * part[0].count("\n"), text)
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Sentences of a document: of paragraphs, lists and cells of tables. Code counts as one word."""
+    text = _LINK.sub(r"\1", re.sub(r"`[^`\n]*`", "`x`", _NOT_PROSE.sub("\n\n", text)))
+    for block in _BLOCK_END.split(text):
+        words = " ".join(block.split()).lstrip("-* ")
+        yield from (each for each in _SENTENCE_END.split(words) if " " in each)
+
+
+def prose() -> tuple[dict[str, int], dict[str, list[str]]]:
+    """Counts of the documents, and where each was found."""
+    all_sentences = [(path.relative_to(ROOT), each) for path, text in documents() for each in sentences(text)]
+    lines = [
+        (path.relative_to(ROOT), number, line)
+        for path, text in documents()
+        for number, line in enumerate(text.splitlines(), 1)
+    ]
+    tables = [
+        (len(line), f"{path}:{number} ({len(line)})") for path, number, line in lines if "|" in line[:1]
+    ]
+    details = {
+        "sentences over 30 words, per cent": [f"{p}: {s}" for p, s in all_sentences if len(s.split()) > 30],
+        "sentences that begin with Who or What": [
+            f"{p}: {s}" for p, s in all_sentences if _BARE_SUBJECT.match(s)
+        ],
+        "lines of documents over 100 characters": [
+            f"{path}:{number} ({len(line)})"
+            for path, number, line in lines
+            if len(line) > 100 and line[0] != "|"
+        ],
+        "characters of the widest row of a table": [max(tables)[1]] if tables else [],
+    }
+    counts = {name: len(found) for name, found in details.items()}
+    counts["sentences over 30 words, per cent"] = -(
+        -100 * counts["sentences over 30 words, per cent"] // max(1, len(all_sentences))
+    )
+    counts["characters of the widest row of a table"] = max(tables)[0] if tables else 0
+    counts["lines of README.md"] = sum(path.name == "README.md" for path, _, _ in lines)
+    return counts, details
 
 
 def say(line: str) -> None:
@@ -202,9 +275,10 @@ def main(arguments: list[str]) -> int:
     }
     counts = {name: len(lines) for name, lines in details.items()}
     counts["files in import circles"] = sum(int(line.split()[0]) for line in circle_lines)
-    counts["lines of relay_server/service.py"] = len(
-        (ROOT / "relay_server/service.py").read_text().splitlines()
-    )
+    prose_counts, prose_details = prose()
+    counts |= prose_counts
+    details |= prose_details
+    counts["lines of relay_server/relay.py"] = len((ROOT / "relay_server/relay.py").read_text().splitlines())
     counts["lines of a function, 90th percentile"] = lengths[len(lengths) * 9 // 10][0]
     worse = [name for name, limit in LIMITS.items() if counts[name] > limit]
     for name, limit in LIMITS.items():

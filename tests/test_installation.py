@@ -1,4 +1,4 @@
-"""What each side needs to be installed: a robot no server parts, a server no ROS."""
+"""Dependencies of each side: a robot needs no server parts, a server no ROS."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ def run_without(absent: list[str], body: str) -> subprocess.CompletedProcess[str
 
 @pytest.mark.parametrize("module", ["robot_client.cli", "robot_client.run", "robot_client.motion.guard"])
 def test_the_daemon_imports_without_the_servers_dependencies(module: str) -> None:
-    """A robot installs the extra 'robot' alone."""
+    """A robot installs only the extra 'robot'."""
     done = run_without(SERVER_ONLY, f"import {module}")
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("module", ["robot_client.cli", "robot_client.run", "robot_client.motion.guard"])
 def test_the_daemon_imports_without_what_cameras_need(module: str) -> None:
-    """The extra 'video' is for robots that show pictures."""
+    """The extra 'video' is for robots with cameras."""
     done = run_without(VIDEO_ONLY, f"import {module}")
     assert done.returncode == 0, done.stderr
 
 
-def test_a_robot_without_opencv_says_what_to_install() -> None:
-    """What is missing, and the command that brings it."""
+def test_a_robot_without_opencv_names_what_to_install() -> None:
+    """The error has the missing package and the command that installs it."""
     body = """
 from relay_protocol.errors import Unavailable
 from robot_client.camera import check_installed
@@ -71,15 +71,15 @@ except Unavailable as error:
     assert "without numpy: No module named numpy (pip install 'robot-switchboard[video]')" in done.stdout
 
 
-@pytest.mark.parametrize("module", ["relay_server.cli", "relay_server.service", "relay_server.run"])
+@pytest.mark.parametrize("module", ["relay_server.cli", "relay_server.relay", "relay_server.run"])
 def test_the_relay_imports_without_ros(module: str) -> None:
-    """A server installs the extra 'server' alone."""
+    """A server installs only the extra 'server'."""
     done = run_without(ROBOT_ONLY, f"import {module}")
     assert done.returncode == 0, done.stderr
 
 
-def test_the_daemon_says_in_words_that_ros_is_missing(tmp_path: object) -> None:
-    """Without rclpy the daemon's command line works, and 'run' names what to install."""
+def test_the_daemon_explains_that_ros_is_missing(tmp_path: object) -> None:
+    """Without rclpy the daemon's command line works, and 'run' names the missing package."""
     body = f"from robot_client.cli import main; main(['run', '--state', {str(tmp_path)!r}])"
     done = run_without(["rclpy"], body)
     assert done.returncode != 0

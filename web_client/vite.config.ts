@@ -1,3 +1,4 @@
+import { appendFileSync, readFileSync } from 'node:fs'
 import { fileURLToPath } from 'node:url'
 import { svelte } from '@sveltejs/vite-plugin-svelte'
 import { defineConfig, type Plugin } from 'vite'
@@ -16,17 +17,34 @@ const withoutXml: Plugin = {
   },
 }
 
+/** Styles that Sass imports are not among the modules whose licences Vite collects. */
+const bootstrapLicence: Plugin = {
+  name: 'bootstrap-licence',
+  writeBundle({ dir }) {
+    const folder = here('./node_modules/bootstrap/')
+    const { version } = JSON.parse(readFileSync(`${folder}package.json`, 'utf8')) as { version: string }
+    const text = readFileSync(`${folder}LICENSE`, 'utf8')
+    appendFileSync(`${dir}/licences.md`, `\n## bootstrap - ${version} (MIT)\n\n${text}`)
+  },
+}
+
 export default defineConfig({
-  plugins: [svelte(), withoutXml],
+  plugins: [svelte(), withoutXml, bootstrapLicence],
   // Absolute, because index.html also answers for /cockpit/<robot>, where relative addresses would miss.
   base: '/',
   resolve: {
     alias: {
+      cbor2: here('./src/lib/ros/cbor.ts'),
       // roslib imports these for encodings the portal never asks for.
-      bson: here('./src/lib/unused-encodings.ts'),
-      cbor2: here('./src/lib/unused-encodings.ts'),
-      'fast-png': here('./src/lib/unused-encodings.ts'),
-      ws: here('./src/lib/unused-encodings.ts'),
+      bson: here('./src/lib/ros/unused-encodings.ts'),
+      'fast-png': here('./src/lib/ros/unused-encodings.ts'),
+      ws: here('./src/lib/ros/unused-encodings.ts'),
+    },
+  },
+  css: {
+    // Bootstrap 5 is written in the older Sass.
+    preprocessorOptions: {
+      scss: { quietDeps: true, silenceDeprecations: ['import', 'global-builtin', 'color-functions', 'if-function'] },
     },
   },
   build: {

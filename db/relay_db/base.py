@@ -1,4 +1,4 @@
-"""What all tables share: names for constraints, and the column types both databases agree on."""
+"""Shared by all tables: names of constraints, and column types that are the same in both databases."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NAMING = {
     "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
     "pk": "pk_%(table_name)s",
 }
-"""Every constraint has a name of its own, so that a migration can change it on both databases."""
+"""Every constraint has a name, so that a migration can change it in both databases."""
 
 
 class Base(DeclarativeBase):
@@ -28,16 +28,16 @@ class Base(DeclarativeBase):
 def canonical_json(value: object) -> str:
     """The one JSON text for a value: sorted keys, no blanks, ASCII only.
 
-    ASCII, because PostgreSQL stores neither NUL nor lone surrogates; escaped they go through.
+    ASCII, because PostgreSQL stores neither NUL nor lone surrogates unless they are escaped.
 
     :raises ValueError: NaN or Infinity
-    :raises TypeError: something JSON has no form for
+    :raises TypeError: a value that JSON cannot express
     """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 class JsonText(TypeDecorator[Any]):
-    """JSON kept as canonical text: the same bytes in both databases, so that a hash over them holds."""
+    """JSON as canonical text: the same bytes in both databases, so that hashes over them agree."""
 
     impl = Text
     cache_ok = True

@@ -1,4 +1,4 @@
-"""What users, groups and realms may be called, and what free text is kept as."""
+"""Normal forms of names and free text before they are stored or searched."""
 
 from __future__ import annotations
 
@@ -8,40 +8,40 @@ import unicodedata
 from relay_db.models import LABEL, NAME
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import NAME_BYTES
-from relay_protocol.realms import full_name, parted
-from relay_protocol.text import legible
+from relay_protocol.realms import full_name, split_name
+from relay_protocol.text import is_printable
 
 _HEX = re.compile(r"[0-9a-f]{1,64}\Z")
 
 
 def normal_name(text: str, what: str = "name") -> str:
-    """The one form of a name: NFKC, lower case. ``Ann`` and ``ann`` are the same person.
+    """The normal form of a name: NFKC, lower case. ``Ann`` and ``ann`` are the same user.
 
-    :param what: whose name it is, for the error
-    :raises Invalid: empty, over 63 characters, not :func:`legible`, with blanks or ``@``, or beginning with ``-``
+    :param what: words for the name in errors
+    :raises Invalid: empty, over 63 characters, not :func:`is_printable`, with blanks or ``@``, or beginning with ``-``
     """
-    # Normalising takes quadratic time where many marks stand on one letter.
+    # Normalising takes quadratic time if one letter has many combining marks.
     if len(text) > NAME_BYTES or len(text.encode("utf-8", "surrogatepass")) > NAME_BYTES:
         raise Invalid(f"the {what} must have 1 to {NAME} characters, and {NAME_BYTES} bytes at most")
     name = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
     if not 0 < len(name) <= NAME:
         raise Invalid(f"the {what} must have 1 to {NAME} characters")
-    if not legible(name) or any(character.isspace() for character in name):
+    if not is_printable(name) or any(character.isspace() for character in name):
         raise Invalid(
             f"the {what} must be printable, without spaces, line breaks, control characters and U+FFFD, which "
             "stands for bytes that are no text"
         )
     if "@" in name:
-        raise Invalid(f"the {what} must not have an '@' in it: what follows one is a realm, as in toad@lab1")
+        raise Invalid(f"the {what} must not contain '@', which separates the realm, as in toad@lab1")
     if name[0] == "-":
         raise Invalid(f"the {what} must not begin with '-'")
     return name
 
 
 def normalise(text: str) -> str:
-    """A name to look for. One that can't be is looked for as the empty one, which nobody has.
+    """The normal form of a name to search for; empty, which matches nothing, if the name is not valid.
 
-    Text from anywhere must not reach the database as it is: PostgreSQL fails on NUL and on half characters.
+    Text from the network must not reach the database unchecked: PostgreSQL fails on NUL and lone surrogates.
     """
     try:
         return normal_name(text)
@@ -50,31 +50,31 @@ def normalise(text: str) -> str:
 
 
 def full_name_of(text: str) -> str:
-    """The one name by which the whole relay knows somebody or something, however its realm is written.
+    """The full name of a user, group or robot, with its realm in normal form.
 
     :param text: as ``mobile@Lab2``
     """
-    name, realm = parted(text)
+    name, realm = split_name(text)
     return full_name(name, normalise(realm) or realm)
 
 
-def findable_hex(text: str) -> str:
-    """A fingerprint or hash to look for; what can't be one is looked for as the empty one."""
+def normalise_hex(text: str) -> str:
+    """A fingerprint or hash to search for; empty, which matches nothing, if it is not valid."""
     return text if _HEX.match(text) else ""
 
 
-def label(text: str, what: str) -> str:
-    """Free text of one line that a person gave, checked.
+def checked_label(text: str, what: str) -> str:
+    """Check free text of one line.
 
-    :raises Invalid: over 255 characters, or not :func:`legible`
+    :raises Invalid: over 255 characters, or not :func:`is_printable`
     """
-    if len(text) > LABEL or not legible(text):
+    if len(text) > LABEL or not is_printable(text):
         raise Invalid(f"the {what} must be one printable line of at most {LABEL} characters")
     return text
 
 
 def sanitise(text: str, length: int = LABEL) -> str:
-    """Text from anyone, made fit to be kept: what can't be printed is escaped, what is too long is cut."""
+    """Text that can be stored: unprintable characters are escaped, and long text is cut."""
     printable = "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
         for character in text[:length]

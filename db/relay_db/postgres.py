@@ -1,4 +1,4 @@
-"""PostgreSQL as we want it: a lost server is noticed in seconds, and no query holds a thread for ever."""
+"""Settings for PostgreSQL: a lost server is noticed in seconds, and every query has a time limit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from sqlalchemy import URL, Engine, create_engine
 from relay_protocol.errors import Invalid
 
 WRITERS = 4
-"""Threads that write at a time; a relay's changes are small and rare."""
+"""Write transactions at a time; changes are small and rare."""
 
 _DEFAULTS = {
     "connect_timeout": "5",
@@ -18,7 +18,7 @@ _DEFAULTS = {
     "application_name": "switchboard",
     "options": "-c lock_timeout=5s -c statement_timeout=20s -c idle_in_transaction_session_timeout=60s",
 }
-"""libpq parameters; the URL may say otherwise. Seconds, but for tcp_user_timeout in milliseconds."""
+"""libpq parameters, which the URL may override. Seconds; tcp_user_timeout in milliseconds."""
 
 
 def open_engine(url: URL) -> Engine:

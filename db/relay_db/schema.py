@@ -1,6 +1,6 @@
-"""Brings the tables of a database up to what this code expects.
+"""Upgrades the tables of a database to the version of this code.
 
-Alembic takes a third of a second to import, so it is only asked when something is to be done.
+Importing Alembic takes a third of a second, so it is imported only if there is something to upgrade.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from sqlalchemy import Connection, inspect, text
 
 from relay_protocol.errors import Unavailable
 
-HEAD = "0009"
+HEAD = "0024"
 """The newest migration in ``migrations/versions``."""
 
 _LOCK = 0x5357_4244
@@ -19,14 +19,14 @@ _LOCK = 0x5357_4244
 
 
 def is_current(connection: Connection) -> bool:
-    """Whether the tables are those of :data:`HEAD`."""
+    """Whether the tables have the version :data:`HEAD`."""
     return _version(connection) == HEAD
 
 
 def upgrade(connection: Connection) -> None:
-    """Run the migrations that are missing, within the open write transaction.
+    """Run the missing migrations within the open write transaction.
 
-    :raises Unavailable: the database was written by newer code
+    :raises Unavailable: the database was written by a newer version
     """
     if connection.dialect.name == "postgresql":
         connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})

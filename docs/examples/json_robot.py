@@ -1,4 +1,4 @@
-"""A robot without ROS: a sensor, wheels with a watchdog, a service. docs/robots.md explains it from top to bottom.
+"""A robot without ROS: a sensor, wheels with a watchdog, a service. docs/guides/robots.md explains it.
 
 python json_robot.py HOST PORT ROBOT CODE FILE    (the enrolment code is needed once; the file keeps the key)
 """
@@ -97,7 +97,7 @@ def hold(holder):
 def obey(op, said):
     """Do what the relay orders; what speaks against it."""
     topic, until = said.get("resource"), now() + said.get("ms", 0) * MS
-    if op == "control":
+    if op == "control_grant":
         hold(said.get("holder", 0))
     elif op == "stop":
         me.setdefault("stopped", {"by": said["by"], "why": said.get("why", ""), "since": time.time()})
@@ -230,14 +230,14 @@ def order(links, control, op, said):
         prove(control, said["nonce"])
     elif op == "welcome":
         robot.heartbeat = min(max(0.1, float(said["heartbeat"])), 60)
-        robot.wait, robot.safety, control.ping_due = 0.5, None, 0
+        robot.wait, robot.motion_state, control.ping_due = 0.5, None, 0
         describe(control)
     elif op == "open_channel" and len(links) < 10:
         links.append(dial(control.socket.getpeername()[:2], 4 * 1024 * 1024))
         say(links[-1], "join", version=1, ticket=said["ticket"])
-    elif op in ("control", "stop", "resume", "suppress", "inhibit"):
+    elif op in ("control_grant", "stop", "resume", "suppress", "inhibit"):
         reason = obey(op, said)
-        say(control, "done", id=said["id"], ok=not reason, reason=reason)
+        say(control, "order_result", id=said["id"], ok=not reason, reason=reason)
     elif op != "close_channel":  # the relay then hangs up on the channel's own link, too
         if op in ("refused", "challenge"):  # a challenge of another relay: nothing was signed
             seconds = float(said.get("retry_after") or 30)  # without a time only a person can help
@@ -276,7 +276,7 @@ def request(link, op, said):
         say(link, "action_result", id=said["id"], status=0, result=False, reason="there are no actions")
     elif not op.startswith(("sample", "unadvertise_", "cancel_")):  # these want no answer
         ref = next((str(said[each]) for each in ("number", "service", "action", "type") if each in said), "")
-        say(link, "failed", what=op, ref=ref, reason="this small robot does not have that")
+        say(link, "failed", request=op, reference=ref, reason="this small robot does not have that")
 
 
 def publish(link):
@@ -343,9 +343,9 @@ def serve(links, link, ready):
     if now() >= link.ping_due:
         link.ping_due = now() + min(1, robot.heartbeat) * SECOND
         say(link, "ping", t=now())
-    if link is links[0] and link.ping_due < math.inf and safety() != robot.safety:
-        robot.safety = safety()
-        say(link, "safety", **safety(lambda until: max(0, until - now()) // MS))
+    if link is links[0] and link.ping_due < math.inf and safety() != robot.motion_state:
+        robot.motion_state = safety()
+        say(link, "motion_state", **safety(lambda until: max(0, until - now()) // MS))
     publish(link)
 
 

@@ -1,4 +1,4 @@
-"""A robot that measures and moves nothing, in as few lines as is honest. docs/robots.md begins with it.
+"""A robot that measures and moves nothing, in as few lines as is honest. docs/guides/robots.md begins with it.
 
 python sensor_robot.py HOST PORT ROBOT CODE FILE    (the enrolment code is needed once; the file keeps the key)
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 TOPIC, TYPE = "/temperature", "std_msgs/msg/Float32"
-ORDERS = ("control", "stop", "resume", "suppress", "inhibit")
+ORDERS = ("control_grant", "stop", "resume", "suppress", "inhibit")
 HOST, PORT, NAME, CODE, FILE = sys.argv[1:]
 quiet = {"until": 0.0, "hold": False}
 
@@ -132,7 +132,7 @@ async def register(control):
     control.say("describe", platform="json")
     topics = {TOPIC: {"types": [TYPE], "publishers": ["/robot"]}}
     control.say("graph", full=True, topics=topics, nodes={"/robot": {}})
-    control.say("safety", **safety(0))
+    control.say("motion_state", **safety(0))
     control.ping_due = 0
 
 
@@ -179,9 +179,9 @@ async def serve(control):
             said = await control.take("open_channel", "close_channel", *ORDERS)
             if said["op"] in ORDERS:
                 reason = obey(said)
-                holder = said.get("holder", 0) if said["op"] == "control" else holder
-                control.say("done", id=said["id"], ok=not reason, reason=reason)
-                control.say("safety", **safety(holder))
+                holder = said.get("holder", 0) if said["op"] == "control_grant" else holder
+                control.say("order_result", id=said["id"], ok=not reason, reason=reason)
+                control.say("motion_state", **safety(holder))
             if said["op"] == "open_channel":  # one at a time: the new one replaces the old one
                 channel.cancel()
                 channel = asyncio.create_task(join(control, said["ticket"]))
@@ -218,7 +218,7 @@ def request(link, said):
         link.say("action_result", id=said["id"], status=0, result=False, reason="this robot has no actions")
     elif not op.startswith(("sample", "unadvertise", "cancel_")):  # these want no answer
         ref = next((str(said[each]) for each in ("number", "service", "action", "type") if each in said), "")
-        link.say("failed", what=op, ref=ref, reason=f"this robot only publishes {TOPIC}")
+        link.say("failed", request=op, reference=ref, reason=f"this robot only publishes {TOPIC}")
 
 
 # 4. For ever

@@ -1,7 +1,7 @@
 """The contract between relay, robots and clients: frames, messages, ROS types, rights, errors, limits.
 
 Nothing here opens a socket. Bytes and objects go in, objects and bytes come out.
-The words are in ``protocol/SPEC.md``; these modules are the same contract in code.
+The words are in ``protocol/spec``; these modules are the same contract in code.
 """
 
 PROTOCOL_VERSION = 1

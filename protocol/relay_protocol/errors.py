@@ -1,29 +1,29 @@
-"""What can go wrong, told by whose fault it is.
+"""Exceptions, by whose fault they are.
 
 ::
 
     SwitchboardError
-    ├── PeerError            the other end broke the contract
+    ├── PeerError            the other end violated the protocol
     │   ├── FrameTooLarge    a frame over the agreed limit; nothing was allocated
     │   └── MalformedMessage bytes that are no message of this protocol
-    ├── Refused              the asker may not have what it asked for
-    ├── NotFound             what was asked for does not exist, or must not be known to
-    ├── Invalid              a value of the right form but the wrong content
-    └── Unavailable          right and well-formed, but not possible now
+    ├── Refused              the caller lacks the right, or the request is not allowed
+    ├── NotFound             the resource does not exist, or its existence is not disclosed
+    ├── Invalid              a well-formed value that is not allowed
+    └── Unavailable          a valid request that cannot be served now
 
-``str(error)`` is a sentence for the person at the other end: it says what was wrong and, where that is not
-plain, what to do. It never holds a secret, a path or a traceback.
+``str(error)`` is shown to the user at the other end. It says what was wrong and, where that is not obvious, what to do.
+It never contains a secret, a file path or a traceback.
 """
 
 
 class SwitchboardError(Exception):
-    """Anything the product reports in words."""
+    """Base of all errors that are reported to users. ``code`` is machine-readable."""
 
     code = "error"
 
 
 class PeerError(SwitchboardError):
-    """The other end broke the contract; the link can't be trusted any more."""
+    """The other end violated the protocol, and the link is closed."""
 
     code = "protocol_error"
 
@@ -41,24 +41,24 @@ class MalformedMessage(PeerError):
 
 
 class Refused(SwitchboardError):
-    """The asker may not have what it asked for."""
+    """The caller lacks the right, or the request is not allowed."""
 
     code = "refused"
 
 
 class NotFound(SwitchboardError):
-    """What was asked for does not exist for this asker."""
+    """The resource does not exist for this caller."""
 
     code = "not_found"
 
 
 class Invalid(SwitchboardError):
-    """A value of the right form with content that can't be."""
+    """A well-formed value that is not allowed."""
 
     code = "invalid"
 
 
 class Unavailable(SwitchboardError):
-    """A rightful request that can't be served now; trying again later may help."""
+    """A valid request that cannot be served now; a later attempt may succeed."""
 
     code = "unavailable"

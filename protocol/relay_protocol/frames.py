@@ -1,4 +1,4 @@
-"""Frames of the robot link (SPEC section 2.1): u32 big-endian length, u8 kind, body.
+"""Frames of the robot link (SPEC 2.1): u32 big-endian length, u8 kind, body.
 
 The length counts the kind and the body. It is checked against the limit before anything is allocated.
 """
@@ -11,38 +11,46 @@ from typing import NamedTuple
 import msgspec
 
 from relay_protocol.errors import FrameTooLarge, MalformedMessage
-from relay_protocol.limits import PARTS_BYTES
+from relay_protocol.limits import INCOMPLETE_SAMPLE_BYTES
 
 JSON = 0
 SAMPLE = 1
 VIDEO = 2
 PART = 3
-PICTURE_PART = 4
+VIDEO_PART = 4
 COMMAND = 5
+FILE_PART = 6
 
 _LENGTH = struct.Struct("!I").unpack_from
 _HEAD = struct.Struct("!IB")
-_SAMPLE_HEAD = struct.Struct("!IBIQ").pack
+pack_sample_head = struct.Struct("!IBIQ").pack
+"""Length of the frame without this field, kind, number, stamp."""
+
 _NUMBERED = struct.Struct("!IQ").unpack_from
-_COMMAND_HEAD = struct.Struct("!IBIQI").pack
+pack_command_head = struct.Struct("!IBIQI").pack
+"""As :data:`pack_sample_head`, with the source after the stamp."""
+
 _COMMAND = struct.Struct("!IQI").unpack_from
 _PART_HEAD = struct.Struct("!IBIQII")
 _PART = struct.Struct("!IQII")
+
+_FILE_HEAD = struct.Struct("!IBIQ")
+_FILE = struct.Struct("!IQ")
 
 MAX_U32 = 2**32 - 1
 MAX_U64 = 2**64 - 1
 
 SAMPLE_HEAD = 13
-"""Kind, number and stamp of a sample, counted by the length of its frame."""
+"""Bytes of kind, number and stamp of a sample; the length field of its frame counts them."""
 
 COMMAND_HEAD = 17
-"""The same of a command, which has a source too."""
+"""Bytes of kind, number, stamp and source of a command."""
 
 JSON_NUMBER = 0
 """Parts of this number make a JSON message. No subscription or publication has it."""
 
 UNFINISHED = 1024
-"""Most samples that have come in part only, over one link."""
+"""Most samples of one link of which some parts, but not all, have been received."""
 
 
 class _Frame(msgspec.Struct, frozen=True):
@@ -85,19 +93,22 @@ class CommandFrame(_Frame, frozen=True, order=True, gc=False):
 
 
 class VideoFrame(_Frame, frozen=True, order=True, gc=False):
-    """Kind 2: one picture of a stream; ``stamp`` is the robot's wall clock in nanoseconds."""
+    """Kind 2: one encoded image of a camera stream; ``stamp`` is the robot's wall clock in nanoseconds."""
 
     number: int
     stamp: int
     body: bytes
 
 
-class PicturePart(_Frame, frozen=True, order=True, gc=False):
-    """Kind 4: one part of a picture; who takes it answers each, so :class:`PictureJoiner` is not the decoder's.
+class VideoFramePart(_Frame, frozen=True, order=True, gc=False):
+    """Kind 4: one part of the body of a :class:`VideoFrame`.
 
-    :param number: of the picture, like ``stamp``
-    :param total: bytes of the whole picture
-    :param offset: bytes of it that went before
+    The decoder does not join these parts, because the receiver acknowledges each one and joins them by
+    :class:`VideoFrameJoiner`.
+
+    :param number: the same for all parts of an image, like ``stamp``
+    :param total: bytes of the whole image
+    :param offset: bytes of the image before this part
     """
 
     number: int
@@ -107,8 +118,21 @@ class PicturePart(_Frame, frozen=True, order=True, gc=False):
     body: bytes
 
 
-Frame = JsonFrame | SampleFrame | CommandFrame | VideoFrame | PicturePart
-"""What a stream is cut into; parts (kind 3) come out as the sample or the JSON message they make."""
+class FilePart(_Frame, frozen=True, order=True, gc=False):
+    """Kind 6: a part of a file that a robot uploads.
+
+    :param upload: number of the upload
+    :param offset: bytes of the file before this part
+    """
+
+    upload: int
+    offset: int
+    body: bytes
+
+
+Frame = JsonFrame | SampleFrame | CommandFrame | VideoFrame | VideoFramePart | FilePart
+"""The frames that :class:`FrameDecoder` returns. It joins parts of kind 3 to a :class:`SampleFrame` or
+:class:`JsonFrame`."""
 
 
 def encode_json(body: bytes) -> bytes:
@@ -118,36 +142,41 @@ def encode_json(body: bytes) -> bytes:
 
 def encode_sample(number: int, stamp: int, body: bytes) -> bytes:
     """The frame around one topic sample; see :class:`SampleFrame`."""
-    return _SAMPLE_HEAD(len(body) + 13, SAMPLE, number, stamp) + body
+    return pack_sample_head(len(body) + 13, SAMPLE, number, stamp) + body
 
 
 def encode_command(number: int, stamp: int, source: int, body: bytes) -> bytes:
     """The frame around one command; see :class:`CommandFrame`."""
-    return _COMMAND_HEAD(len(body) + COMMAND_HEAD, COMMAND, number, stamp, source) + body
+    return pack_command_head(len(body) + COMMAND_HEAD, COMMAND, number, stamp, source) + body
 
 
 def encode_video(number: int, stamp: int, body: bytes) -> bytes:
-    """The frame around one picture; see :class:`VideoFrame`."""
-    return _SAMPLE_HEAD(len(body) + 13, VIDEO, number, stamp) + body
+    """The frame around one image; see :class:`VideoFrame`."""
+    return pack_sample_head(len(body) + 13, VIDEO, number, stamp) + body
 
 
-def encode_part(number: int, stamp: int, total: int, offset: int, piece: bytes) -> bytes:
+def encode_part(number: int, stamp: int, total: int, offset: int, part: bytes) -> bytes:
     """The frame around one part of a sample; see :class:`SampleFrame`.
 
     :param number: :data:`JSON_NUMBER` for a part of a JSON message
     :param total: bytes of the whole message
-    :param offset: bytes of it that went before
+    :param offset: bytes of the message before this part
     """
-    return _PART_HEAD.pack(len(piece) + 21, PART, number, stamp, total, offset) + piece
+    return _PART_HEAD.pack(len(part) + 21, PART, number, stamp, total, offset) + part
 
 
-def encode_picture_part(number: int, stamp: int, total: int, offset: int, piece: bytes | memoryview) -> bytes:
-    """The frame around one part of a picture; see :class:`PicturePart`."""
-    return _PART_HEAD.pack(len(piece) + 21, PICTURE_PART, number, stamp, total, offset) + piece
+def encode_video_part(number: int, stamp: int, total: int, offset: int, part: bytes | memoryview) -> bytes:
+    """The frame around one part of an image; see :class:`VideoFramePart`."""
+    return _PART_HEAD.pack(len(part) + 21, VIDEO_PART, number, stamp, total, offset) + part
+
+
+def encode_file_part(upload: int, offset: int, body: bytes) -> bytes:
+    """The frame around a part of a file; see :class:`FilePart`."""
+    return _FILE_HEAD.pack(len(body) + 13, FILE_PART, upload, offset) + body
 
 
 class FrameDecoder:
-    """Cuts a byte stream into frames, and joins parts of samples.
+    """Decodes a byte stream into frames, and joins the parts of samples and of JSON messages.
 
     :param limit: largest length field accepted, bytes; it may be raised once the peer has proved itself
     """
@@ -155,29 +184,29 @@ class FrameDecoder:
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.sample_limit = 0
-        """Largest sample accepted in parts, bytes; what fits into a frame is accepted in any case."""
+        """Largest sample accepted in parts, bytes. A sample that fits into a frame is accepted in any case."""
         self._buffer = bytearray()
-        self._enough = 0
-        """With fewer bytes in the buffer nothing new can be said."""
+        self._bytes_needed = 0
+        """Bytes that the buffer must hold before the next frame can be complete."""
         self._parts = _Parts()
 
     @property
     def buffered(self) -> int:
-        """Bytes of an unfinished frame and of unfinished samples held back."""
+        """Bytes held of an incomplete frame and of incomplete samples."""
         return len(self._buffer) + self._parts.size
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Take bytes as they come off the wire; return the frames they complete.
+        """Take received bytes; return the frames that they complete.
 
-        :raises FrameTooLarge: a length over :attr:`limit`, seen before its body is awaited; a sample in parts that
-            would be over it, or too much of such samples
-        :raises MalformedMessage: an empty frame, an unknown kind, a sample too short for its head, parts that don't
+        :raises FrameTooLarge: a length field is over :attr:`limit` (found before the body is received), a sample in
+            parts is over :attr:`sample_limit`, or too many bytes of incomplete samples are held
+        :raises MalformedMessage: an empty frame, an unknown kind, a frame too short for its head, parts that don't
             follow each other
         """
         buffer = self._buffer
         if buffer:
             buffer += data
-            if len(buffer) < self._enough:
+            if len(buffer) < self._bytes_needed:
                 return []
             # Bytes, because a slice of them is a body; one of a bytearray has to be copied once more.
             data = bytes(buffer)
@@ -209,7 +238,7 @@ class FrameDecoder:
             start = end
         if start < have:
             buffer += memoryview(data)[start:]
-            self._enough = 4 + length if have - start >= 4 else 4
+            self._bytes_needed = 4 + length if have - start >= 4 else 4
         return frames
 
 
@@ -220,17 +249,19 @@ class _Unfinished(NamedTuple):
 
 
 class _Parts:
-    """Samples of one link that have come in part only; memory grows with what came, not with what was announced."""
+    """Joins the parts of samples of one link. Memory grows with the bytes received, not with the sizes announced."""
 
     def __init__(self) -> None:
         self.size = 0
         self._unfinished: dict[int, _Unfinished] = {}
 
     def join(self, buffer: bytes, start: int, end: int, limit: int, largest: int) -> SampleFrame | None:
-        """Take one part; return the sample it completes.
+        """Take one part; return the sample that it completes.
 
-        :param limit: largest frame
-        :param largest: largest sample
+        :param start: index of the kind in the buffer
+        :param end: index after the part
+        :param limit: largest frame, bytes
+        :param largest: largest sample, bytes
         """
         if end - start < 22:
             raise MalformedMessage(
@@ -252,8 +283,8 @@ class _Parts:
             body += memoryview(buffer)[start + 21 : end]
             return SampleFrame(number, stamp, bytes(body))
         self.size += size
-        # One of the largest, beside those that would fit into a frame.
-        most = min(PARTS_BYTES, 2 * limit) + (largest if largest > limit else 0)
+        # One sample of the largest size, beside those that would fit into a frame.
+        most = min(INCOMPLETE_SAMPLE_BYTES, 2 * limit) + (largest if largest > limit else 0)
         if self.size > most or len(self._unfinished) > UNFINISHED:
             raise FrameTooLarge(
                 f"{len(self._unfinished)} samples of {self.size} bytes are unfinished; that is too much"
@@ -283,10 +314,10 @@ class _Parts:
             self.size -= len(known.body)
 
 
-class PictureJoiner:
-    """Makes a picture of its parts; memory grows with what came, not with what was announced.
+class VideoFrameJoiner:
+    """Joins the parts of one image at a time. Memory grows with the bytes received, not with the size announced.
 
-    :param limit: most bytes of a picture
+    :param limit: most bytes of an image
     """
 
     def __init__(self, limit: int) -> None:
@@ -296,27 +327,29 @@ class PictureJoiner:
 
     @property
     def size(self) -> int:
-        """Bytes of the picture that is not whole."""
+        """Bytes held of the incomplete image."""
         return len(self._body)
 
-    def join(self, part: PicturePart) -> VideoFrame | None:
-        """Take one part; return the picture it completes. One that begins ends what was not whole.
+    def join(self, part: VideoFramePart) -> VideoFrame | None:
+        """Take one part; return the image that it completes. The first part of an image drops an incomplete one.
 
-        :raises FrameTooLarge: the picture would be over the limit
-        :raises MalformedMessage: the part does not follow the one before, or is longer than its picture
+        :raises FrameTooLarge: the image would be over the limit
+        :raises MalformedMessage: the part does not follow the one before, or is longer than its image
         """
         if part.total > self._limit:
             raise FrameTooLarge(
-                f"a picture of {part.total} bytes was announced; at most {self._limit} are taken here"
+                f"a video frame of {part.total} bytes was announced; at most {self._limit} are taken here"
             )
         head = (part.number, part.stamp, part.total)
         if part.offset == 0:
             self.drop()
             self._head = head
         elif head != self._head or part.offset != len(self._body):
-            raise MalformedMessage(f"a part of picture {part.number} does not follow the one before it")
+            raise MalformedMessage(f"a part of video frame {part.number} does not follow the one before it")
         if part.offset + len(part.body) > part.total:
-            raise MalformedMessage(f"parts of picture {part.number} are longer than its {part.total} bytes")
+            raise MalformedMessage(
+                f"parts of video frame {part.number} are longer than its {part.total} bytes"
+            )
         self._body += part.body
         if len(self._body) < part.total:
             return None
@@ -325,7 +358,7 @@ class PictureJoiner:
         return whole
 
     def drop(self) -> None:
-        """Forget what is not whole: it was given up."""
+        """Drop the incomplete image, as its sender has given it up."""
         self._head = None
         self._body = bytearray()
 
@@ -345,14 +378,19 @@ def _parse(buffer: bytes, start: int, end: int) -> Frame:
             raise MalformedMessage("a command needs 16 bytes of number, stamp and source")
         number, stamp, source = _COMMAND(buffer, start + 1)
         return CommandFrame(number, stamp, source, buffer[start + 17 : end])
-    if kind == PICTURE_PART:
+    if kind == VIDEO_PART:
         if end - start < 22:
             raise MalformedMessage(
-                "a part of a picture needs 20 bytes of head, and at least one of the picture"
+                "a part of a video frame needs 20 bytes of head, and at least one byte of the frame"
             )
         number, stamp, total, offset = _PART.unpack_from(buffer, start + 1)
-        return PicturePart(number, stamp, total, offset, buffer[start + 21 : end])
+        return VideoFramePart(number, stamp, total, offset, buffer[start + 21 : end])
+    if kind == FILE_PART:
+        if end - start < 14:
+            raise MalformedMessage("a part of a file needs 12 bytes of head, and at least one of the file")
+        upload, at = _FILE.unpack_from(buffer, start + 1)
+        return FilePart(upload, at, buffer[start + 13 : end])
     raise MalformedMessage(
-        f"frame kind {kind} is not known; 0 is JSON, 1 a sample, 2 a picture, 3 and 4 parts of these, "
-        "5 a command"
+        f"frame kind {kind} is not known; 0 is JSON, 1 a sample, 2 a video frame, 3 and 4 parts of these, "
+        "5 a command, 6 a part of a file"
     )

@@ -1,7 +1,7 @@
-"""How a robot proves who it is: Ed25519 (RFC 8032) over a text naming purpose, relay and robot.
+"""A robot's proof of identity: an Ed25519 signature (RFC 8032) over purpose, relay, robot and nonce.
 
-The private key never leaves the robot; the relay keeps the public half. A signature is good for one nonce
-of one connection, so a recorded one is worthless.
+The private key never leaves the robot; the relay keeps the public half. A signature is valid for one nonce
+of one connection, so it cannot be replayed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def fingerprint(public_key: bytes) -> str:
 
 
 def proof_text(relay: str, robot: str, nonce: bytes) -> bytes:
-    """What is signed. Lengths come first, so no two triples give the same text."""
+    """The signed text. Each part follows its length, so no two triples give the same text."""
     parts = (relay.encode(), robot.encode(), nonce)
     return _CONTEXT + b"".join(len(part).to_bytes(2, "big") + part for part in parts)
 
@@ -56,7 +56,7 @@ def public_half(private_key: bytes) -> bytes:
 
 
 def sign(private_key: bytes, relay: str, robot: str, nonce: bytes) -> bytes:
-    """The proof a robot sends for a challenge."""
+    """A robot's signature for a challenge."""
     return Ed25519PrivateKey.from_private_bytes(private_key).sign(proof_text(relay, robot, nonce))
 
 

@@ -40,6 +40,9 @@ ODD_VALUES, ODD_OBJECTS = 131_072, 16_384
 """Commas, and braces, of a text with values that are not simply those of their fields' types: each takes ten times as
 long."""
 
+ESCAPES_BEYOND = 131_072
+"""Backslashes of a text of more than :data:`LARGE` bytes with NaN or infinity, which are looked for outside strings."""
+
 _WORDS = ("objects and arrays", "strings and names of fields", "values (commas)")
 
 
@@ -85,3 +88,25 @@ def check_odd(data: bytes) -> None:
             f"of more than {ODD_VALUES} values, or {ODD_OBJECTS} objects, one does not fit its type, or is null, NaN, "
             "infinite, or an integer written with a point; send all in their fields' types, or fewer at once"
         )
+
+
+def check_literals(data: bytes) -> None:
+    """Refuse a text with NaN or infinity that takes too long to mark these.
+
+    :raises TooCostly: as :func:`check_odd`, or it is large and has more than :data:`ESCAPES_BEYOND` backslashes
+    """
+    if len(data) > LARGE and _has_more_escapes_than(ESCAPES_BEYOND, data):
+        raise TooCostly(
+            f"a message of more than {LARGE} bytes with NaN or infinity may have {ESCAPES_BEYOND} backslashes; send "
+            "texts or numbers alone, or less"
+        )
+    check_odd(data)
+
+
+def _has_more_escapes_than(most: int, data: bytes) -> bool:
+    """Counts by the megabyte, as to count millions takes long."""
+    for at in range(0, len(data), MIB):
+        most -= data.count(b"\\", at, at + MIB)
+        if most < 0:
+            return True
+    return False

@@ -1,7 +1,17 @@
-"""Strict JSON at the edge: valid UTF-8, bounded depth, no NaN, no key twice, and errors that name the fault.
+"""Strict JSON: valid UTF-8, bounded depth, no NaN, no key twice in an object, and errors that name the fault.
 
-msgspec skips values it does not need without looking into them: neither their UTF-8 nor their depth is
-checked there. So the text is checked once, as a whole, before anything is decoded.
+msgspec skips values that it does not need: it checks neither their UTF-8 nor their depth. So each text is checked
+once, as a whole, before it is decoded.
+
+RFC 8259 section 4 leaves open which of two equal keys counts. The relay and a robot could read the same text
+differently, so such text is refused. msgspec and orjson silently take the last one. The parser of the standard library
+reports all pairs, but takes as long as all other work on a small message. So cheap proofs come first:
+
+- A short message is looked up by its shape: its text without the characters of numbers. A stream of commands has one.
+- A short message of a new shape is decoded and encoded again. A lost key is a lost colon.
+- In a long message with few strings the quotation marks are searched.
+
+What none of them proves goes to the parser of the standard library. All of them take linear time.
 """
 
 from __future__ import annotations
@@ -15,10 +25,14 @@ from typing import Any, TypeVar, get_args
 import msgspec
 
 from relay_protocol.errors import MalformedMessage
-from relay_protocol.json_keys import check_keys
 from relay_protocol.limits import JSON_DEPTH
 
 T = TypeVar("T")
+
+# --- UTF-8 and depth --------------------------------------------------------------------------------------
+
+_COUNTED_BYTES = 4096
+"""Up to this length brackets are counted; in a longer text a search for each is faster."""
 
 
 def check_text(data: bytes, depth: int = JSON_DEPTH) -> None:
@@ -33,16 +47,30 @@ def check_text(data: bytes, depth: int = JSON_DEPTH) -> None:
             str(data, "utf-8")
         except UnicodeDecodeError as error:
             raise MalformedMessage(f"the message is not valid UTF-8 (byte {error.start})") from None
-    # Fewer opening brackets than the limit can't be nested deeper: the usual case costs one count, and one search
-    # (for a number, which is four times as fast as for bytes).
-    opened = data.count(b"{")
-    if _OPENING in data:
-        opened += data.count(b"[")
-    if opened > depth and _deepest(data) > depth:
+    # Too few bytes, or fewer opening brackets than the limit, can't be nested deeper. Each level takes two bytes of a
+    # list, and five of an object (``{"":`` and ``}``).
+    least = depth * (2 if _LIST in data else 5)
+    if len(data) > least and _opens_more_than(depth, data) and _deepest(data) > depth:
         raise MalformedMessage(f"the message nests arrays and objects deeper than {depth}")
 
 
-_OPENING = ord("[")
+def _opens_more_than(most: int, data: bytes) -> bool:
+    """Whether a text has more opening brackets. A search is 50 times as fast as a count, but there is one for each."""
+    if len(data) <= _COUNTED_BYTES:
+        # Whether a number is in bytes is found out four times as fast as whether bytes are.
+        return data.count(b"{") + (data.count(b"[") if _LIST in data else 0) > most
+    for bracket in _OPENING_BRACKETS:
+        at = data.find(bracket)
+        while at >= 0:
+            if most == 0:
+                return True
+            most -= 1
+            at = data.find(bracket, at + 1)
+    return False
+
+
+_OPENING_BRACKETS = b"{["
+_LIST = ord("[")
 
 
 def _deepest(data: bytes) -> int:
@@ -61,7 +89,7 @@ def decode(decoder: msgspec.json.Decoder[T], data: bytes) -> T:
     """Decode one checked message.
 
     :raises MalformedMessage: not JSON, not of the type the decoder wants, or refused by :func:`check_text` or
-        :func:`relay_protocol.json_keys.check_keys`
+        :func:`check_keys`
     """
     check_text(data)
     try:
@@ -92,9 +120,28 @@ _ANY: msgspec.json.Decoder[Any] = msgspec.json.Decoder()
 def decode_any(data: bytes) -> Any:
     """Decode a checked message without a schema; see :func:`decode`."""
     value = decode(_ANY, data)
-    if len(data) >= _DIGITS_OF_DOUBLE and _LONG_RUN in data.translate(_ALL_DIGITS_ALIKE):
-        _check_range(data)
+    if len(data) >= _DIGITS_OF_DOUBLE:
+        _check_long_numbers(data)
     return value
+
+
+def recode(data: bytes) -> bytes:
+    """Decode a text without a schema and encode it again: compact, and well-formed whatever came in.
+
+    :raises MalformedMessage: as :func:`decode_any`
+    """
+    check_text(data)
+    try:
+        value = _ANY.decode(data)
+    except FAULTS as error:
+        raise malformed(error, Any) from None
+    if len(data) >= _DIGITS_OF_DOUBLE:
+        _check_long_numbers(data)
+    text = encode(value)
+    # What comes out of a dict has each key once; so has what went in, if it is the same.
+    if text != data and not _keeps_colons(data, text):
+        check_keys(data)
+    return text
 
 
 def in_range(data: bytes) -> bool:
@@ -108,9 +155,10 @@ def in_range(data: bytes) -> bool:
     return len(data) < _DIGITS_OF_DOUBLE and _LARGE_E not in data and _exponent(data) is None
 
 
-def _check_range(data: bytes) -> None:
+def _check_long_numbers(data: bytes) -> None:
     """Refuse JSON with a number that no double can hold: msgspec takes integers of any length."""
-    json.loads(data, parse_int=_in_range, parse_float=_in_range)
+    if _LONG_RUN in data.translate(_ALL_DIGITS_ALIKE):
+        json.loads(data, parse_int=_in_range, parse_float=_in_range)
 
 
 def _in_range(digits: str) -> float:
@@ -146,3 +194,140 @@ def _sentence(text: str, wanted: Any) -> str:
 
 encode = msgspec.json.Encoder().encode
 """Any message struct or plain value to compact JSON bytes."""
+
+
+# --- keys -------------------------------------------------------------------------------------------------
+
+SHORT_BYTES = 2048
+"""Length up to which a text is looked up by its shape."""
+
+SHAPES = 512
+"""Most shapes that are stored; together they have at most 1 MiB."""
+
+OF_NUMBERS = b"0123456789+-.eE"
+"""Characters that a shape does not have."""
+
+_NOT_BRACES = bytes(byte for byte in range(256) if byte not in b"{}")
+_OPENING, _CLOSING = ord("{"), ord("}")
+_ESCAPED_COLON = b"\\u003"
+"""How an escaped colon begins."""
+
+_SPARSE = 64
+"""Bytes per string from which on a search for quotation marks is faster than parsing."""
+
+_SHOWN = 40
+"""Characters of a key in an error message."""
+
+proved_shapes: set[bytes] = set()
+"""ASCII shapes of texts that passed :func:`check_text` and :func:`check_keys`. Texts of such a shape pass both,
+whatever numbers stand in them."""
+
+_seen_shapes: set[bytes] = set()
+"""Shapes that came once. Proving a shape takes time, which is wasted on a text that never comes again."""
+
+
+def check_keys(data: bytes) -> None:
+    """Refuse JSON in which an object has a key twice, also with different escapes.
+
+    :param data: JSON that passed :func:`check_text`; ``NaN`` and ``Infinity`` are let through
+    :raises MalformedMessage: the sentence names the key
+    """
+    if len(data) <= SHORT_BYTES:
+        shape = data.translate(None, OF_NUMBERS)
+        if shape in proved_shapes:
+            return
+        if _survives(data):
+            _learn(shape)
+            return
+    elif b"\\" not in data and _distinct_by_quotes(data):
+        return
+    try:
+        json.loads(str(data, "utf-8"), strict=False, object_pairs_hook=_pairs, parse_int=len, parse_float=len)
+    except ValueError as error:
+        raise MalformedMessage(f"the message is not JSON: {error}") from None
+
+
+def _learn(shape: bytes) -> None:
+    """Note the shape of a text with distinct keys.
+
+    A key with an escape may equal one without. Keys may differ by a digit alone, which the shape does not show. Other
+    digits can part the bytes of a character.
+    """
+    if b"\\" in shape or not shape.isascii():
+        return
+    if shape not in _seen_shapes:
+        _add(_seen_shapes, shape)
+    elif _distinct_by_quotes(shape):
+        _add(proved_shapes, shape)
+
+
+def _add(shapes: set[bytes], shape: bytes) -> None:
+    if len(shapes) >= SHAPES:
+        shapes.clear()
+    shapes.add(shape)
+
+
+def _survives(data: bytes) -> bool:
+    """Whether no key is lost when the text is decoded and encoded again."""
+    try:
+        return _keeps_colons(data, encode(_ANY.decode(data)))
+    except FAULTS:
+        return False
+
+
+def _keeps_colons(data: bytes, again: bytes) -> bool:
+    """Whether a text that was decoded and encoded again still has all its colons.
+
+    There is one for each key, and those in strings, which stay as they are. An escape may add one.
+    """
+    return _ESCAPED_COLON not in data and again.count(b":") == data.count(b":")
+
+
+def _distinct_by_quotes(data: bytes) -> bool:
+    """Whether each object is seen to have each key once; false also for a text of many strings.
+
+    Long strings and long lists of numbers are skipped in C.
+
+    :param data: JSON without a backslash; its numbers may be missing
+    """
+    keys: set[bytes] = set()
+    outer: list[set[bytes]] = []
+    most = max(len(data) // _SPARSE, SHORT_BYTES)
+    begun = at = 0
+    for _ in range(most):
+        start = data.find(b'"', at)
+        between = data[at:start] if start >= 0 else data[at:]
+        if at and (between[:1] == b":" or between.lstrip()[:1] == b":"):
+            key = data[begun : at - 1]
+            if key in keys:
+                return False
+            keys.add(key)
+        if _OPENING in between or _CLOSING in between:
+            for brace in between.translate(None, _NOT_BRACES):
+                if brace == _OPENING:
+                    outer.append(keys)
+                    keys = set()
+                elif not outer:
+                    # No JSON; the parser names the fault.
+                    return False
+                else:
+                    keys = outer.pop()
+        if start < 0:
+            return True
+        begun = start + 1
+        at = data.find(b'"', begun) + 1
+    return False
+
+
+def _pairs(pairs: list[tuple[str, Any]]) -> None:
+    """Check one object; nothing of it is stored."""
+    if len(dict(pairs)) == len(pairs):
+        return
+    keys = set()
+    for key, _ in pairs:
+        if key in keys:
+            shown = key if len(key) <= _SHOWN else key[: _SHOWN - 3] + "..."
+            raise MalformedMessage(
+                f"the message has the key '{shown}' twice in one object; send each key once"
+            )
+        keys.add(key)

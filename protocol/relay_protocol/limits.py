@@ -1,23 +1,23 @@
-"""Sizes, times and counts that both ends agree on. Imports nothing of ours.
+"""Sizes, times and counts that both ends agree on (SPEC 5). Imports nothing of ours.
 
-Sizes are bytes, times are seconds, unless a name says otherwise.
+Sizes are in bytes and times in seconds, unless the name says otherwise.
 """
 
 KIB = 1024
 MIB = 1024 * KIB
 
 HANDSHAKE_FRAME = 16 * KIB
-"""Largest frame on a robot link that has not proved who it is."""
+"""Largest frame on a robot link that is not authenticated."""
 
 ROBOT_FRAME = 16 * MIB
-"""Largest frame a proven robot may send on a channel link (a point cloud or a raw picture)."""
+"""Largest frame an authenticated robot may send on a channel link, for example a point cloud."""
 
 ROBOT_SAMPLE = 64 * MIB
-"""Largest sample a robot may send in parts, unless the relay or the robot is set otherwise."""
+"""Largest sample a robot may send in parts; default of a setting of relay and robot."""
 
-LEAST_SAMPLE = 1 * MIB
-MOST_SAMPLE = 1024 * MIB
-"""What the largest sample may be set to."""
+MIN_SAMPLE = 1 * MIB
+MAX_SAMPLE = 1024 * MIB
+"""Range of that setting."""
 
 CONTROL_FRAME = 1 * MIB
 """Largest frame a robot may send on its control link."""
@@ -26,58 +26,118 @@ JSON_BODY = 1 * MIB
 """Largest JSON text taken from a robot: a sample in JSON, the JSON values of an answer."""
 
 GRAPH_BYTES = 8 * MIB
-"""Memory the relay spends on the mirror of one robot's graph."""
+"""Most memory of the relay's mirror of one robot's graph."""
 
-GRAPH_ENDS = 1024
-"""Most types of a topic or service, and most nodes at each of its ends."""
+GRAPH_NODES = 1024
+"""Most types of a topic or service, and most publishers, subscribers or servers of it."""
 
 TYPE_TEXTS = 16 * MIB
 """Most characters of type definitions taken from one robot."""
 
 INTERFACES = 8192
-"""Most names of types a robot tells of at once."""
+"""Most type names in one message of a robot."""
 
-PICTURE_FRAME = 4 * MIB
-"""Largest frame a robot may send on a video link: one picture as JPEG or PNG, or one of H.264."""
+VIDEO_FRAME = 4 * MIB
+"""Largest frame a robot may send on a video link: one image as JPEG, PNG or H.264."""
 
-PICTURE_SIDE = 8192
-"""Most pixels of a picture in a row or a column."""
+IMAGE_SIDE = 8192
+"""Largest width and height of a camera frame, pixels."""
 
 CAMERAS = 256
 """Most cameras of a robot."""
 
-PARTS_BYTES = 2 * ROBOT_FRAME
-"""Most bytes of samples that have come in part only, over one link."""
+STRIDE = 1000
+"""Largest stride at which points of a cloud are kept."""
 
-FRAGMENTS = 16
-"""Most messages a client may have sent in part only."""
+VOXEL = 1000.0
+"""Largest side of a cube of which one point is kept, metres."""
+
+ASSET = 64 * MIB
+"""Largest file that a robot sends as an asset, for example a mesh."""
+
+ASSET_PART = 128 * KIB
+"""Most bytes of an asset in one message."""
+
+ASSET_URI = 1024
+"""Longest URI of an asset, characters."""
+
+MODULES = 64
+"""Most modules of a robot."""
+
+FILE_NAME = 1024
+"""Longest name of a file of a robot with its folders, bytes of UTF-8."""
+
+FILE_PART = 16 * KIB
+"""Largest part of a file that is uploaded."""
+
+FILE_UNCONFIRMED = 512 * KIB
+"""Most bytes of files on one link that the relay has not confirmed yet."""
+
+FILE_UPLOADS = 16
+"""Most files that are uploaded at a time over one link."""
+
+LOG_LINES = 500
+"""Most lines of a module's log in one answer."""
+
+LOG_BYTES = 256 * KIB
+"""Most bytes of text in one answer with lines of a log."""
+
+LOG_WAIT_SECONDS = 30.0
+"""Longest time a robot waits for a new line before it answers."""
+
+PROCESSES = 512
+"""Most processes of a robot in one measurement."""
+
+INCOMPLETE_SAMPLE_BYTES = 2 * ROBOT_FRAME
+"""Most bytes of incomplete samples on one link."""
+
+INCOMPLETE_MESSAGES = 16
+"""Most incomplete messages of one client (rosbridge fragments)."""
 
 FRAGMENT_SECONDS = 10.0
-"""A message of which a fragment is missing for so long is given up."""
+"""An incomplete message is discarded after this time."""
 
-LABEL = 255
-"""Longest fact a robot tells of itself (host, agent, …), in characters."""
+LABEL_LENGTH = 255
+"""Longest fact about a robot (host, agent, …), characters."""
 
-FACTS = 64
-"""Most further facts (``extra``), and most names in each list of what a robot counts as motion."""
+LIST_ITEMS = 64
+"""Most entries of a short list or map of a robot, for example ``extra`` facts or patterns of motion topics."""
 
-WORDS = 4096
-"""Longest sentence for people that comes over a robot link, in characters; longer ones are cut."""
+REASON_LENGTH = 500
+"""Longest reason of a stop or of another request about control that is kept, characters; longer ones are cut."""
 
-COMMAND_FRAME = 4 * MIB
-"""Largest JSON message the relay sends to a robot."""
+STOP_ID_LENGTH = 64
+"""Longest id of a stop that a client makes, characters; a longer one counts as none."""
 
-ROBOT_MESSAGE = 16 * MIB
-"""Largest sample or command the relay sends to a robot, with the head of its frame."""
+TEXT_LENGTH = 4096
+"""Longest text for display on a robot link, characters; longer ones are cut."""
+
+RELAY_JSON_FRAME = 4 * MIB
+"""Largest frame with a JSON message that the relay sends to a robot."""
+
+RELAY_FRAME = 16 * MIB
+"""Largest frame that the relay sends to a robot: one with a sample or a command."""
 
 CLIENT_MESSAGE = 10_000_000
-"""Largest websocket message, and frame, a client may send, unless the relay is set otherwise; as rosbridge_server's."""
+"""Largest websocket message of a client, as in rosbridge_server; default of a setting of the relay."""
 
-UNPROVEN_BYTES = 64 * KIB
-"""What a connection may send before it is authenticated."""
+UNAUTHENTICATED_BYTES = 64 * KIB
+"""Most bytes a connection may send before it is authenticated."""
 
-UNPROVEN_SECONDS = 10.0
-"""How long a connection may take to authenticate, an absolute deadline."""
+HTTP_BODY = 56 * KIB
+"""Largest body of an HTTP request; with it a connection takes less than 64 KiB of the relay's memory."""
+
+FUNCTION_BYTES = 16 * MIB
+"""Largest arguments, and largest result, of a call of a function, as MessagePack."""
+
+FUNCTION_BODY = 24 * MIB
+"""Largest body of an HTTP request that calls a function: arguments in base64 take a third more."""
+
+FILE_BODY = 8 * MIB
+"""Largest body of an HTTP request that uploads a file, or a part of one."""
+
+UNAUTHENTICATED_SECONDS = 10.0
+"""A connection must authenticate within this time after it was accepted."""
 
 JSON_DEPTH = 64
 """Deepest nesting of arrays and objects in a JSON message."""
@@ -86,45 +146,46 @@ TYPE_DEFINITION = 256 * KIB
 """Largest .msg/.srv text, with all types it contains, taken from a robot."""
 
 NAME = 255
-"""Longest name of a topic, service, type or node, in characters (as in DDS)."""
+"""Longest name of a topic, service, type or node, characters (as in DDS)."""
 
 NAME_BYTES = 256
-"""Longest name of a user, group, realm, OAuth client or header field that is read at all."""
+"""Longest name of a user, group, realm, OAuth client or header field; longer ones are rejected unread."""
 
 ROBOT_NAME = 63
-"""Longest name of a robot, in characters (a DNS label)."""
+"""Longest name of a robot, characters (a DNS label)."""
 
 ENROLMENT_SECONDS = 15 * 60
-"""An enrolment code is good for this long, once."""
+"""Validity of an enrolment code, which works once."""
 
 TICKET_SECONDS = 60
-"""A single-use ticket for an address of a client is good for this long."""
+"""Validity of a single-use ticket in a client's URL."""
 
 CHANNEL_TICKET_SECONDS = 30
-"""A robot has this long to join a channel or a stream it was asked to open."""
+"""A robot must join a channel or stream within this time after the request."""
 
 HEARTBEAT_SECONDS = 1.25
-"""Each end of a robot link pings this often; three missed and the link is lost, and people are told within 5 s."""
+"""Interval of pings in each direction. After three without an answer the link is lost, so users see it within 5 s."""
 
 HEARTBEATS_MISSED = 3
+"""Pings in a row without an answer after which a link is lost."""
 
 COMMAND_DEADLINE_MS = 500
-"""No motion command older than this is executed."""
+"""Older motion commands are dropped."""
 
 STOP_WITHIN_MS = 500
 """A robot stands still within this time of its last valid motion command."""
 
 SUPPRESS_MS = (50, 200)
-"""Least and greatest time, in milliseconds, for which a topic's commands come from others than the holder."""
+"""Shortest and longest suppression of a topic, milliseconds."""
 
 INHIBIT_MS = 60_000
-"""Greatest time, in milliseconds, for which a topic says nothing."""
+"""Longest inhibition of a topic, milliseconds."""
 
 SOURCES = 256
-"""Most connections a suppression names."""
+"""Most connections in one suppression."""
 
 LINGER_SECONDS = 5.0
-"""A channel stays open this long after its last client."""
+"""A channel stays open for this time after its last session."""
 
 CALL_SECONDS = 30.0
-"""A service call that names no timeout is given up after this long."""
+"""Default timeout of a service call."""

@@ -10,7 +10,7 @@ the link carries in the round trip of the empty link and :data:`TARGET`. The rat
 A late answer alone says nothing about the link: a busy machine answers late too. So the window of a sender that never
 has to wait for it stays as it is.
 
-Used by the relay towards clients and robots, and by robots towards the relay. Pure: times are given.
+Used by the relay towards clients and robots, and by robots towards the relay. No I/O, no clock: times are given.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class SendWindow:
         self.sent = 0
         """Bytes sent so far."""
         self.arrived = 0
-        """Bytes of them that have arrived, as far as probes have told."""
+        """Bytes of them that have arrived, as far as probes have shown."""
         self.trip: float | None = None
         """Round trip of the empty link; ``None`` before the first answer."""
         self.delay = 0.0
@@ -176,9 +176,14 @@ class SendWindow:
         self._learn(probe, gained, now)
         return True
 
-    def all_arrived(self) -> None:
-        """Everything sent has arrived, as another source than a probe says."""
-        self.arrived = self.sent
+    def all_arrived(self, *, but: int) -> int:
+        """Everything sent has arrived except for the last bytes, as another source than a probe says.
+
+        :returns: bytes that are now known to have arrived and were not before
+        """
+        gained = max(0, self.sent - but - self.arrived)
+        self.arrived += gained
+        return gained
 
     def _learn(self, probe: _Probe, gained: int, now: float) -> None:
         trip, flight, least = now - probe.at, probe.position - probe.arrived, self.trip

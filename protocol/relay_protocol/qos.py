@@ -1,4 +1,4 @@
-"""Quality of service as clients write it (SPEC 1.2, ``qos``), brought to the one form that goes to robots."""
+"""Parses the quality of service of clients (SPEC 1.2, ``qos``) into the form that robots receive."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from msgspec.structs import force_setattr
 
 from relay_protocol import link
 
-WORDS = {
+POLICIES = {
     "history": ("keep_last", "keep_all"),
     "reliability": ("reliable", "best_effort", "best_available"),
     "durability": ("volatile", "transient_local", "best_available"),
 }
-"""What a policy may be. ``system_default`` is known as well and counts as left out."""
+"""Values of each policy. ``system_default`` is accepted as well, and means the same as no value."""
 
-FOREVER = 1e9
-"""Seconds; a time this long or longer is no limit. ROS 2 writes its infinite durations as 2**63 - 1 nanoseconds."""
+UNLIMITED_SECONDS = 1e9
+"""A duration this long or longer means no limit. ROS 2 writes infinite durations as 2**63 - 1 nanoseconds."""
 
 _SYSTEM_DEFAULT = "system_default"
 _TIMES = {"deadline": ("infinite", "best_available"), "lifespan": ("infinite",)}
@@ -24,9 +24,9 @@ _LARGEST_DEPTH = 2**31 - 1
 
 
 class QoS(link.QoS, frozen=True, kw_only=True):
-    """:class:`relay_protocol.link.requests.QoS` that takes all the ways clients write its values in.
+    """:class:`relay_protocol.link.channel.QoS` that accepts every spelling clients use for its values.
 
-    :raises ValueError: a value that is none of those known; msgspec adds where it was
+    :raises ValueError: an unknown value; msgspec adds the path to it
     """
 
     history: Any = None
@@ -37,36 +37,40 @@ class QoS(link.QoS, frozen=True, kw_only=True):
     lifespan: Any = None
 
     def __post_init__(self) -> None:
-        """One form for each value."""
-        for name in WORDS:
-            force_setattr(self, name, _word(name, getattr(self, name)))
+        """Normalise every value."""
+        for name in POLICIES:
+            force_setattr(self, name, _policy(name, getattr(self, name)))
         force_setattr(self, "depth", _depth(self.depth))
         for name in _TIMES:
             force_setattr(self, name, _seconds(name, getattr(self, name)))
 
 
-def _word(name: str, value: Any) -> str | None:
+def _policy(name: str, value: Any) -> str | None:
     if value is None:
         return None
-    word = value.lower() if isinstance(value, str) else ""
-    if word == _SYSTEM_DEFAULT:
+    policy = value.lower() if isinstance(value, str) else ""
+    if policy == _SYSTEM_DEFAULT:
         return None
-    if word not in WORDS[name]:
-        raise ValueError(f"qos: {name} is {', '.join(WORDS[name])} or {_SYSTEM_DEFAULT}, not {_shown(value)}")
-    return word
+    if policy not in POLICIES[name]:
+        raise ValueError(
+            f"qos: {name} must be {', '.join(POLICIES[name])} or {_SYSTEM_DEFAULT}, not {_shown(value)}"
+        )
+    return policy
 
 
 def _depth(value: Any) -> int | None:
-    """A depth of 0 is the middleware's own, as in ROS 2."""
+    """A depth of 0 means the middleware's default, as in ROS 2."""
     if value is None:
         return None
     if not _is_number(value) or value != value // 1 or not 0 <= value <= _LARGEST_DEPTH:
-        raise ValueError(f"qos: depth is a whole number of messages, 0 for the usual, not {_shown(value)}")
+        raise ValueError(
+            f"qos: depth must be a whole number of messages, 0 for the default, not {_shown(value)}"
+        )
     return int(value) or None
 
 
 def _seconds(name: str, value: Any) -> float | None:
-    """A time of 0 is no time given, as in ROS 2."""
+    """A duration of 0 means no value, as in ROS 2."""
     if value is None or (isinstance(value, str) and value.lower() in _TIMES[name]):
         return None
     if isinstance(value, dict):
@@ -80,9 +84,9 @@ def _seconds(name: str, value: Any) -> float | None:
     if seconds is None:
         words = " or ".join(f"'{each}'" for each in _TIMES[name])
         raise ValueError(
-            f"qos: {name} is a time in seconds, an object with sec and nanosec, or {words}, not {_shown(value)}"
+            f"qos: {name} must be a time in seconds, an object with sec and nanosec, or {words}, not {_shown(value)}"
         )
-    return seconds if 0 < seconds < FOREVER else None
+    return seconds if 0 < seconds < UNLIMITED_SECONDS else None
 
 
 def _is_number(value: Any) -> bool:

@@ -1,7 +1,7 @@
-"""Rights on a robot, compiled once and asked at every message.
+"""Rights on a robot, compiled once and checked at every message.
 
 A right is a level, with optional patterns that allow or deny more. Deny beats allow, allow beats the
-level, and what nothing allows is denied.
+level, and everything else is denied.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 from relay_protocol.errors import Invalid
-from relay_protocol.wildcards import see_cheap
+from relay_protocol.wildcards import check_pattern
 
 
 class Level(str, enum.Enum):
-    """How far a right goes; each level includes the ones before it."""
+    """Levels of rights; each includes the ones before it."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
@@ -29,25 +29,29 @@ class Level(str, enum.Enum):
 
 
 class Operation(str, enum.Enum):
-    """What one may do to a resource of a robot."""
+    """Operations on the resources of a robot."""
 
     SUBSCRIBE = "subscribe"
     VIEW = "view"
-    """See the pictures of a camera."""
+    """Watch a camera."""
     RECORD = "record"
-    """Have the relay keep what a topic or camera says, and get at what was kept."""
+    """Record topics and cameras on the relay, and download recordings."""
+    DOWNLOAD = "download"
+    """List and download files that the robot has uploaded."""
     PUBLISH = "publish"
     CONTROL = "control"
-    """Be the one who moves the robot."""
+    """Hold control of the robot."""
     CALL = "call"
     PROVIDE = "provide"
-    """Offer a service or an action to the robot's graph."""
+    """Advertise a service or an action in the robot's graph."""
     SUPPRESS = "suppress"
-    """Command a topic in the place of who holds control, for moments."""
+    """Suppress: command a topic in place of the holder of control, for milliseconds."""
     INHIBIT = "inhibit"
-    """Have a topic say nothing, for a time."""
+    """Inhibit a topic: nothing is published on it for a time."""
+    RUN = "run"
+    """Have a function run on the relay's workers, for this robot."""
     MANAGE = "manage"
-    """Change who may do what on this robot."""
+    """Change rights on this robot."""
 
     def __str__(self) -> str:
         return self.value
@@ -55,49 +59,51 @@ class Operation(str, enum.Enum):
 
 _RANK = {Level.VIEWER: 0, Level.OPERATOR: 1, Level.OWNER: 2}
 
-_NEEDED = {
+_REQUIRED = {
     Operation.SUBSCRIBE: Level.VIEWER,
     Operation.VIEW: Level.VIEWER,
     Operation.RECORD: Level.OPERATOR,
+    Operation.DOWNLOAD: Level.VIEWER,
     Operation.PUBLISH: Level.OPERATOR,
     Operation.CONTROL: Level.OPERATOR,
     Operation.CALL: Level.OPERATOR,
     Operation.PROVIDE: Level.OPERATOR,
+    Operation.RUN: Level.OPERATOR,
     Operation.SUPPRESS: Level.OWNER,
     Operation.INHIBIT: Level.OWNER,
     Operation.MANAGE: Level.OWNER,
 }
 
 
-def needed(operation: Operation) -> Level:
-    """The least level that includes an operation without patterns."""
-    return _NEEDED[operation]
+def required_level(operation: Operation) -> Level:
+    """The lowest level that includes an operation without patterns."""
+    return _REQUIRED[operation]
 
 
 def includes(level: Level, other: Level) -> bool:
-    """Whether a level goes as far as another."""
+    """Whether a level includes another."""
     return _RANK[level] >= _RANK[other]
 
 
 _ALL = "*"
 
-_PARTS = "/_action/"
-"""In the names of the topics and services that an action is made of (ROS 2 design, actions)."""
+_ACTION_INFIX = "/_action/"
+"""Part of the names of an action's topics and services (design.ros2.org, actions)."""
 
-_OF_ACTION = {Operation.PUBLISH: Operation.PROVIDE}
-"""What one needs for the action to do something to its parts, where that is not the same."""
+_ACTION_OPERATION = {Operation.PUBLISH: Operation.PROVIDE}
+"""Operation required on the action for an operation on its topics and services, where they differ."""
 
-_EVENTS = "/_service_event"
-"""How the name of the topic ends on which a service tells of its calls, with all that is in them (REP 2012)."""
+_SERVICE_EVENT = "/_service_event"
+"""Suffix of the topic that carries all requests and responses of a service (REP 2012)."""
 
 
 class Grant(NamedTuple):
-    """One right as it stands in the database, or as a token's scope names it.
+    """One right in the database, or one item of a token's scope.
 
-    :param level: ``None`` where there is nothing but patterns, as in a scope
+    :param level: ``None`` when there are only patterns
     :param allow: patterns ``operation:resource``, e.g. ``call:/reset`` or ``*:/arm/*`` (shell wildcards)
     :param deny: patterns of the same form
-    :param source: whom the right was given to, for the reason: ``user ann`` or ``group lab``
+    :param source: who has the right, for the reason: ``user ann`` or ``group lab``
     """
 
     level: Level | None
@@ -106,8 +112,8 @@ class Grant(NamedTuple):
     source: str = ""
 
 
-class Verdict(NamedTuple):
-    """Yes or no, and why, in words for the one who asked."""
+class Decision(NamedTuple):
+    """Whether an operation is allowed, and the reason for the caller."""
 
     allowed: bool
     reason: str
@@ -118,42 +124,44 @@ def parse_level(text: str) -> Level:
     try:
         return Level(text)
     except ValueError:
-        raise Invalid(f"'{text}' is no level; it is viewer, operator or owner") from None
+        raise Invalid(f"'{text}' is not a level; write viewer, operator or owner") from None
 
 
 def parse_pattern(text: str) -> str:
     """Check one allow or deny pattern and return it normalised.
 
-    :raises Invalid: not ``operation:resource`` with a known operation (or ``*``) and an absolute name, or a pattern
-        that :func:`relay_protocol.wildcards.see_cheap` refuses
+    :raises Invalid: not ``operation:resource`` with a known operation (or ``*``) and an absolute name (for ``manage``
+        also the name of a module or ``processes``), or a pattern that
+        :func:`relay_protocol.wildcards.check_pattern` rejects
     """
     operation, colon, resource = text.partition(":")
     if not colon or operation not in {_ALL, *(str(each) for each in Operation)}:
         known = ", ".join(str(each) for each in Operation)
-        raise Invalid(f"'{text}' is no pattern; write operation:resource with one of {known} or *")
-    if not resource.startswith(("/", "*")):
+        raise Invalid(f"'{text}' is not a pattern; write operation:resource with one of {known} or *")
+    names_module = operation == Operation.MANAGE and resource
+    if not (names_module or resource.startswith(("/", "*"))):
         raise Invalid(f"'{text}': the resource must begin with / (as in publish:/cmd_vel) or be a wildcard")
-    see_cheap(resource)
+    check_pattern(resource)
     return text
 
 
 class Rules:
     """All rights of one principal on one robot, compiled.
 
-    No grants at all means no channel: :attr:`level` is ``None`` and every question is answered with no.
+    Without grants :attr:`level` is ``None`` and every operation is denied.
 
-    :param scope: what the token in use may be used for on this robot; ``None`` for all that its user may
+    :param scope: scope of the token in use on this robot; ``None`` for all rights of its user
     """
 
     def __init__(self, grants: Iterable[Grant] = (), scope: Iterable[Grant] | None = None) -> None:
         self.grants = tuple(grants)
         self.scope = None if scope is None else tuple(scope)
-        self._within = None if self.scope is None else Rules(self.scope)
-        self._own = _highest(self.grants)
-        self.level: Level | None = _lower(self._own, self.scope)
-        self._verdicts: dict[tuple[Operation, str], Verdict] = {}
+        self._scope_rules = None if self.scope is None else Rules(self.scope)
+        self._level = _highest(self.grants)
+        self.level: Level | None = _effective_level(self._level, self.scope)
+        self._decisions: dict[tuple[Operation, str], Decision] = {}
 
-    # Rules are made of all robots that somebody has a right on, and asked about few.
+    # Rules exist for every robot a user has a right on, but only few of them are used.
     @cached_property
     def _allow(self) -> list[_Pattern]:
         return [_compile(text) for grant in self.grants for text in grant.allow]
@@ -167,68 +175,78 @@ class Rules:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Equal for rules that judge alike."""
+        """Equal for rules with equal decisions and reasons."""
         return (self.grants, self.scope)
 
     @cached_property
-    def alike(self) -> tuple[object, ...]:
-        """Equal for rules that judge alike, wherever the rights are from."""
+    def source_free_key(self) -> tuple[object, ...]:
+        """Equal for rules with equal decisions, whatever the source of the rights."""
         return tuple(each and tuple(grant[:3] for grant in each) for each in (self.grants, self.scope))
 
-    def judge(self, operation: Operation, resource: str) -> Verdict:
-        """May the principal do this to that resource of the robot? Answers are kept: names recur."""
+    def decide(self, operation: Operation, resource: str) -> Decision:
+        """Whether the operation on the resource is allowed. Decisions are cached, because names recur."""
         key = (operation, resource)
-        verdict = self._verdicts.get(key)
-        if verdict is None:
-            verdict = self._decide(operation, resource)
-            if len(self._verdicts) < _VERDICTS_KEPT:
-                self._verdicts[key] = verdict
-        return verdict
+        decision = self._decisions.get(key)
+        if decision is None:
+            decision = self._decide(operation, resource)
+            if len(self._decisions) < _MAX_DECISIONS:
+                self._decisions[key] = decision
+        return decision
 
-    def _decide(self, operation: Operation, resource: str) -> Verdict:
-        verdict = self._decide_own(operation, resource)
+    def may_allow(self, operation: Operation) -> bool:
+        """Whether a level or a pattern allows an operation, on whatever resource; patterns that deny are not regarded.
+
+        :param operation: not ``view``, which the right to subscribe includes too
+        """
+        return all(
+            _may_allow(grants, operation) for grants in (self.grants, self.scope) if grants is not None
+        )
+
+    def _decide(self, operation: Operation, resource: str) -> Decision:
+        decision = self._decide_by_grants(operation, resource)
         if (
-            verdict.allowed
-            and self._within is not None
-            and not self._within.judge(operation, resource).allowed
+            decision.allowed
+            and self._scope_rules is not None
+            and not self._scope_rules.decide(operation, resource).allowed
         ):
-            return Verdict(False, f"{operation} on {resource} is outside the scope of your token")
-        return verdict
+            return Decision(False, f"{operation} on {resource} is outside the scope of your token")
+        return decision
 
-    def _decide_own(self, operation: Operation, resource: str) -> Verdict:
-        if self._own is None and not self._allow:
-            return Verdict(False, "you have no right on this robot")
-        service = resource.removesuffix(_EVENTS)
+    def _decide_by_grants(self, operation: Operation, resource: str) -> Decision:
+        if self._level is None and not self._allow:
+            return Decision(False, "you have no right on this robot")
+        service = resource.removesuffix(_SERVICE_EVENT)
         if service != resource:
-            # To hear all that is asked of a service takes what it takes to ask it.
+            # The topic shows all requests, so subscribing needs the right to call the service.
             of_service = Operation.PROVIDE if operation is Operation.PUBLISH else Operation.CALL
-            whole = self._decide_own(of_service, service)
+            whole = self._decide_by_grants(of_service, service)
             if not whole.allowed:
                 return whole
-        action, part, _ = resource.partition(_PARTS)
+        action, part, _ = resource.partition(_ACTION_INFIX)
         if part:
-            whole = self._decide_own(_OF_ACTION.get(operation, operation), action)
+            whole = self._decide_by_grants(_ACTION_OPERATION.get(operation, operation), action)
             if not whole.allowed:
                 return whole
         for pattern in self._deny:
             if pattern.matches(operation, resource):
-                return Verdict(False, f"{operation} on {resource} is denied to you by '{pattern.text}'")
+                return Decision(False, f"{operation} on {resource} is denied to you by '{pattern.text}'")
         for pattern in self._allow:
             if pattern.matches(operation, resource):
-                return Verdict(True, f"allowed by '{pattern.text}'")
+                return Decision(True, f"allowed by '{pattern.text}'")
         if operation is Operation.VIEW:
-            return self._decide_own(Operation.SUBSCRIBE, resource)
-        needed = _NEEDED[operation]
-        if self._own is not None and _RANK[self._own] >= _RANK[needed]:
-            return Verdict(True, f"allowed to {self._own}")
-        return Verdict(
-            False, f"{operation} on {resource} needs the level {needed}; you are {self._own} on this robot"
+            return self._decide_by_grants(Operation.SUBSCRIBE, resource)
+        required = _REQUIRED[operation]
+        if self._level is not None and _RANK[self._level] >= _RANK[required]:
+            return Decision(True, f"allowed to {self._level}")
+        return Decision(
+            False,
+            f"{operation} on {resource} needs the level {required}; you are {self._level} on this robot",
         )
 
 
-_VERDICTS_KEPT = 4096
+_MAX_DECISIONS = 4096
 
-_PATTERNS_KEPT = 4096
+_MAX_PATTERNS = 4096
 
 
 def _highest(grants: tuple[Grant, ...]) -> Level | None:
@@ -236,8 +254,15 @@ def _highest(grants: tuple[Grant, ...]) -> Level | None:
     return max(levels, key=_RANK.__getitem__, default=None)
 
 
-def _lower(own: Level | None, scope: tuple[Grant, ...] | None) -> Level | None:
-    """The level one acts with: what a scope of mere patterns opens, it opens to a viewer."""
+def _may_allow(grants: tuple[Grant, ...], operation: Operation) -> bool:
+    level = _highest(grants)
+    return (level is not None and includes(level, _REQUIRED[operation])) or any(
+        text.partition(":")[0] in (_ALL, operation.value) for grant in grants for text in grant.allow
+    )
+
+
+def _effective_level(own: Level | None, scope: tuple[Grant, ...] | None) -> Level | None:
+    """The effective level; a scope of only patterns limits it to viewer."""
     if own is None or scope is None:
         return own
     if not scope:
@@ -254,7 +279,7 @@ class _Pattern(NamedTuple):
         return self.operation in (_ALL, operation.value) and self.resource.match(resource) is not None
 
 
-@lru_cache(_PATTERNS_KEPT)
+@lru_cache(_MAX_PATTERNS)
 def _compile(text: str) -> _Pattern:
     operation, _, resource = text.partition(":")
     return _Pattern(operation, re.compile(fnmatch.translate(resource)), text)

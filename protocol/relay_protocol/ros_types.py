@@ -1,7 +1,7 @@
 """The types of one robot: their definitions, and conversion of messages between CDR, JSON and CBOR.
 
-JSON has rosbridge's form: arrays of bytes are base64, NaN and infinity are ``null``. So has CBOR: arrays of
-numbers are typed arrays (RFC 8746). For the relay only; a robot passes CDR on unread.
+JSON follows rosbridge: byte arrays are base64, NaN and infinity are ``null``. In CBOR arrays of numbers are typed
+arrays (RFC 8746). Only the relay converts; a robot forwards CDR unread.
 """
 
 from __future__ import annotations
@@ -13,73 +13,74 @@ from typing import Any
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
 from relay_protocol.limits import KIB, MIB, TYPE_TEXTS
-from relay_protocol.ros.compiled import Compiled, Reader, Writer
+from relay_protocol.ros.compiled import CompiledTypes, Reader, Writer
 from relay_protocol.ros.definition import Definition, normalise, parts_of, source_of, text_of
+from relay_protocol.ros.generated_json_to_cdr import Check
 from relay_protocol.ros.typedefs import typedef
 
 __all__ = ["Body", "Reader", "TypeRegistry", "Writer"]
 
-_SHARED_CHARACTERS = 8 * MIB
-_LEAST_CHARACTERS = 4 * KIB
-"""A short text counts as so many, because what is compiled of it takes memory too."""
-_TYPES_OF_A_ROBOT = 4096
+_CACHE_CHARACTERS = 8 * MIB
+_MIN_CHARACTERS = 4 * KIB
+"""Every text counts as at least this many, because compiled types take memory too."""
+_MAX_TYPES = 4096
 
 Body = bytes | dict[str, Any]
 
 
-class _Shared:
-    """A fleet of like robots sends the same texts: each is compiled once. The least used make room."""
+class _CompiledCache:
+    """Caches compiled texts, because the robots of a fleet send the same ones. The least recently used are evicted."""
 
     def __init__(self, characters: int) -> None:
-        self._room = characters
-        self._kept: OrderedDict[tuple[str, str], Compiled] = OrderedDict()
+        self._free_characters = characters
+        self._entries: OrderedDict[tuple[str, str], CompiledTypes] = OrderedDict()
 
-    def compiled(self, type_name: str, text: str) -> Compiled:
+    def compiled(self, type_name: str, text: str) -> CompiledTypes:
         key = (type_name, text)
-        found = self._kept.get(key)
+        found = self._entries.get(key)
         if found is not None:
-            self._kept.move_to_end(key)
+            self._entries.move_to_end(key)
             return found
-        found = self._kept[key] = Compiled(type_name, text)
-        self._room -= max(len(text), _LEAST_CHARACTERS)
-        while self._room < 0:
-            (_, former), _ = self._kept.popitem(last=False)
-            self._room += max(len(former), _LEAST_CHARACTERS)
+        found = self._entries[key] = CompiledTypes(type_name, text)
+        self._free_characters -= max(len(text), _MIN_CHARACTERS)
+        while self._free_characters < 0:
+            (_, former), _ = self._entries.popitem(last=False)
+            self._free_characters += max(len(former), _MIN_CHARACTERS)
         return found
 
 
-_shared = _Shared(_SHARED_CHARACTERS)
+_compiled_cache = _CompiledCache(_CACHE_CHARACTERS)
 
 
 class TypeRegistry:
-    """What one robot's types look like. Names may be given as ``pkg/Name`` or ``pkg/msg/Name``."""
+    """The type definitions of one robot. Names may be given as ``pkg/Name`` or ``pkg/msg/Name``."""
 
     def __init__(self) -> None:
-        self._types: dict[str, Compiled] = {}
+        self._types: dict[str, CompiledTypes] = {}
         self._texts: dict[str, str] = {}
         self._characters = 0
         self._readers: dict[str, dict[str, Reader]] = {"json": {}, "cbor": {}}
         self._writers: dict[bool, dict[str, Writer]] = {False: {}, True: {}}
 
     def add(self, type_name: str, text: str) -> None:
-        """Register a definition; the same again changes nothing, another one replaces the former.
+        """Register a definition. An equal text changes nothing, another one replaces the earlier.
 
         :param type_name: of a message, service or action
-        :param text: as in :class:`relay_protocol.link.answers.TypeDefinition`
+        :param text: as in :class:`relay_protocol.link.channel.TypeDefinition`
         :raises Invalid: a bad name, or a text that is no complete definition
         """
         name = normalise(type_name)
         if self._texts.get(name) == text:
             return
-        if len(self._texts) >= _TYPES_OF_A_ROBOT and name not in self._texts:
-            raise Invalid(f"{name}: this robot has sent {_TYPES_OF_A_ROBOT} types already")
+        if len(self._texts) >= _MAX_TYPES and name not in self._texts:
+            raise Invalid(f"{name}: this robot has sent {_MAX_TYPES} types already")
         characters = self._characters + len(text) - len(self._texts.get(name, ""))
         if characters > TYPE_TEXTS:
             raise Invalid(f"{name}: this robot has sent definitions of {TYPE_TEXTS // MIB} MiB already")
-        compiled = _shared.compiled(name, text)
+        compiled = _compiled_cache.compiled(name, text)
         self._texts[name] = text
         self._characters = characters
-        self._forget_made()
+        self._clear_converters()
         for part in parts_of(name):
             self._types[part] = compiled
         # What it contains is known too, unless the robot sent a text of its own for it.
@@ -102,9 +103,9 @@ class TypeRegistry:
             return False
 
     def definition(self, type_name: str) -> str:
-        """The text as the robot sent it; of what ROS makes of a service or an action, such a text.
+        """The text as the robot sent it, or the text of a type that rosidl derives.
 
-        :raises NotFound: none was sent for just this type
+        :raises NotFound: no text was sent for this type
         """
         name = normalise(type_name)
         text = self._texts.get(name)
@@ -123,9 +124,9 @@ class TypeRegistry:
         return text_of(name, compiled.type_name, compiled.text, compiled.definitions)
 
     def reader(self, type_name: str, form: str) -> Reader:
-        """What turns messages of this type from a robot into ``form``: the fast way for many of them.
+        """A function that converts messages of this type to ``form``.
 
-        It stays right until the robot sends another definition of the type; then ask anew.
+        It is valid until the robot sends another definition of the type.
 
         :param form: ``json`` or ``cbor``
         :raises NotFound: the type is not registered
@@ -138,10 +139,9 @@ class TypeRegistry:
         return found
 
     def writer(self, type_name: str, checked: bool = False) -> Writer:
-        """What turns JSON into messages of this type for a robot; see :meth:`reader`.
+        """A function that converts JSON to messages of this type; see :meth:`reader`.
 
-        :param checked: text that is given to it was looked at by :func:`relay_protocol.jsontext.check_text`
-            before, as part of a larger message
+        :param checked: its text was already checked by :func:`relay_protocol.jsontext.check_text`
         :raises NotFound: the type is not registered
         """
         made = self._writers[checked]
@@ -151,7 +151,23 @@ class TypeRegistry:
             found = made[type_name] = compiled.writer(name, checked)
         return found
 
-    def _forget_made(self) -> None:
+    def check(self, type_name: str) -> Check:
+        """The check of texts for robots that speak JSON; faster than writing. See :meth:`reader`.
+
+        :raises NotFound: the type is not registered
+        """
+        name, types = self._find(type_name)
+        return types.check(name)
+
+    def is_stamped(self, type_name: str) -> bool:
+        """Whether messages of this type have a header somewhere, whose stamp a client may leave out.
+
+        :raises NotFound: the type is not registered
+        """
+        name, types = self._find(type_name)
+        return types.is_stamped(name)
+
+    def _clear_converters(self) -> None:
         for readers in self._readers.values():
             readers.clear()
         for writers in self._writers.values():
@@ -160,10 +176,10 @@ class TypeRegistry:
     def to_json(self, type_name: str, cdr: bytes) -> bytes:
         """A message from a robot as compact JSON.
 
-        :param cdr: with its four-byte encapsulation header, little or big endian. Bytes left over are no
+        :param cdr: with its four-byte encapsulation header, little or big endian. Extra bytes are no
             error: rclpy counts gaps before empty sequences that it does not write, and pads the end.
         :raises NotFound: the type is not registered
-        :raises Invalid: the bytes are no message of this type
+        :raises Invalid: not a message of this type
         """
         found = self._readers["json"].get(type_name) or self.reader(type_name, "json")
         return found(cdr)
@@ -191,7 +207,7 @@ class TypeRegistry:
         :raises NotFound: the type is not registered
         :raises Invalid: see :meth:`from_json`
         """
-        name, compiled = self._find(self._asked(type_name))
+        name, compiled = self._find(self._request_type(type_name))
         value = None if body == b"" else body
         if isinstance(value, bytes) and not value.startswith(b"{"):
             try:
@@ -210,7 +226,7 @@ class TypeRegistry:
         return self.from_json(type_name, {}, 0)
 
     def typedefs(self, type_name: str) -> list[dict[str, Any]]:
-        """rosapi's typedefs of a message and of all it contains, each where it is met first, going down.
+        """rosapi's typedefs of a message and all messages it contains, each once, in depth-first order.
 
         :raises NotFound: the type is not registered
         """
@@ -232,8 +248,8 @@ class TypeRegistry:
         """
         return self._find(type_name)[1].definitions
 
-    def _asked(self, type_name: str) -> str:
-        """The message that asks, of a service or an action; any other name as it is."""
+    def _request_type(self, type_name: str) -> str:
+        """The request of a service or the goal of an action; any other name unchanged."""
         full = [type_name]
         if type_name.count("/") == 1:
             full = [type_name.replace("/", f"/{kind}/") for kind in ("srv", "action")]
@@ -243,7 +259,7 @@ class TypeRegistry:
                     return asking
         return type_name
 
-    def _find(self, type_name: str) -> tuple[str, Compiled]:
+    def _find(self, type_name: str) -> tuple[str, CompiledTypes]:
         compiled = self._types.get(type_name)
         if compiled is not None:
             return type_name, compiled

@@ -1,4 +1,4 @@
-"""rosbridge v2 operations a client may send, as one tagged union (SPEC section 1).
+"""rosbridge v2 operations a client may send, as one tagged union (SPEC 1).
 
 Message bodies stay undecoded (:class:`msgspec.Raw`): the relay decodes only what it judges, and the body
 once, when its type is known.
@@ -7,13 +7,15 @@ once, when its type is known.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import UNSET
 
-from relay_protocol import json_cost, json_keys, jsontext, nonfinite
+from relay_protocol import json_cost, jsontext, nonfinite
 from relay_protocol.limits import JSON_DEPTH, KIB
+from relay_protocol.link import Thinning
 from relay_protocol.message import Body, Message
 from relay_protocol.qos import QoS
 
@@ -23,7 +25,7 @@ Id = str | int | None
 Bodies = list[msgspec.Raw] | dict[str, msgspec.Raw]
 
 
-class Op(Message, frozen=True, kw_only=True):
+class Op(Message, frozen=True, kw_only=True, gc=False):
     """Base of what a client may ask; the ``id`` comes back with answers."""
 
     id: Id = None
@@ -58,6 +60,7 @@ class Subscribe(Op, frozen=True, kw_only=True):
     fragment_size: int | None = None
     compression: str = "none"
     qos: QoS | None = None
+    thin: Thinning | None = None
 
 
 class Unsubscribe(Op, frozen=True, kw_only=True):
@@ -174,21 +177,25 @@ ClientOp = (
     | Auth
 )
 
-_LIST, _COLON, _QUOTE = b'[:"'
-_SHALLOW = 5 * JSON_DEPTH
-"""Objects in each other take at least five bytes each, ``{"":`` and ``}``; the innermost takes two."""
+_LIST, _COLON, _BACKSLASH = b"[:\\"
+_TEXT_IN_BODY = b'"}}'
+"""End of a message whose body ends with a string."""
 
-_MAY_BE_MEANT = ("got `null`", "got `float`")
-"""In msgspec's words about a field that must not be null, or must be an integer."""
+_SHALLOW = 5 * JSON_DEPTH
+"""A shorter text is not nested too deeply: each nested object takes at least five bytes, ``{"":`` and ``}``."""
+
+_TOLERATED_FAULTS = ("got `null`", "got `float`")
+"""Parts of msgspec's errors about a field that is null, or no integer: decoding is tried again without these."""
 
 _BODIES = frozenset(("msg", "args", "values"))
-"""Fields whose null is a value like any other."""
+"""Fields of which null is a valid value."""
 
 _INTEGERS = frozenset(("id", "queue_size", "queue_length", "fragment_size", "num", "total", "status"))
 _EXACT = 2**53
-"""Larger integers are not exact as a double."""
+"""Largest integer up to which all are exact as a double."""
 
-_SHORT, _OF_NUMBERS, _DISTINCT = json_keys.SHORT, json_keys.OF_NUMBERS, json_keys.distinct
+_SHORT, _OF_NUMBERS = jsontext.SHORT_BYTES, jsontext.OF_NUMBERS
+_PROVED = jsontext.proved_shapes
 
 _decode: Callable[[bytes], ClientOp] = msgspec.json.Decoder(ClientOp).decode
 
@@ -197,38 +204,51 @@ def decode(data: bytes) -> ClientOp:
     """One client message. NaN and infinity in its body are marked, see :mod:`relay_protocol.nonfinite`.
 
     :raises MalformedMessage: not strict JSON, a key twice, an unknown ``op``, a field missing or of the wrong type
-    :raises NotFinite: NaN or infinity outside of the body, or in a message of more than 1 MiB
-    :raises TooCostly: see :func:`relay_protocol.json_cost.check`
+    :raises NotFinite: NaN or infinity outside of the body
+    :raises TooCostly: see :func:`relay_protocol.json_cost.check`; with NaN or infinity
+        :func:`relay_protocol.json_cost.check_literals`
     """
-    # As jsontext.decode, with fewer calls: this is done for every message of every client. What is ASCII, without a
-    # list, and too short for many objects in each other has passed all that check_text looks for.
-    if _LIST in data or len(data) > _SHALLOW or not data.isascii():
+    # The checks of jsontext.decode, with fewer calls, as this runs for every message of every client. Messages are
+    # looked up by their shape, but a body that ends with a string has another shape for each string.
+    ends_with_text = data.endswith(_TEXT_IN_BODY)
+    proved = not ends_with_text and len(data) <= _SHORT and data.translate(None, _OF_NUMBERS) in _PROVED
+    # A short ASCII text without a list needs no check of UTF-8, nesting and cost: it is too short to be nested too
+    # deeply.
+    if not proved and (_LIST in data or len(data) > _SHALLOW or not data.isascii()):
         json_cost.check(data)
         jsontext.check_text(data)
     try:
         message = _decode(data)
     except jsontext.FAULTS as error:
-        message = _decode_as_meant(data, error)
-    if len(data) <= _SHORT:
-        # A text, which is another each time, ends like this; it has no shape that is known.
-        if data[-3] == _QUOTE and _has_few_keys(message, data):
+        message = _decode_leniently(data, error)
+    if proved:
+        return message
+    # No object may have a key twice.
+    if ends_with_text and type(message) is Publish:
+        # The body is an object, so its key is not op, topic, type or id, which are no objects. One colon each follows
+        # op, topic, the key of the body, the key of the string, and type and id if they are given. If there are no
+        # further colons, there are no further keys, and these differ.
+        keys = 4
+        if message.type:
+            keys += 1
+        if message.id is not None:
+            keys += 1
+        if (data.count(_COLON) if len(data) <= _SHORT else _colons_before_text(data)) == keys:
             return message
-        if data.translate(None, _OF_NUMBERS) in _DISTINCT:
-            return message
-    json_keys.check_keys(data)
+    jsontext.check_keys(data)
     return message
 
 
-def _has_few_keys(message: ClientOp, data: bytes) -> bool:
-    """Whether a message to a topic has just the keys it must have, and one in ``msg``: there is a colon for each."""
-    return (
-        type(message) is Publish
-        and data.count(b":") == (5 if message.type else 4)
-        and _COLON in bytes(message.msg)
-    )
+def _colons_before_text(data: bytes) -> int:
+    """The number of colons of a long message before its last string; 0 if the start of the string is not certain.
+
+    To find the start of the string is faster than to count the colons in it.
+    """
+    start = -1 if _BACKSLASH in data else data.rfind(b'"', 0, -3)
+    return data.count(_COLON, 0, start) if start < _SHORT else 0
 
 
-def _decode_as_meant(data: bytes, fault: Exception) -> ClientOp:
+def _decode_leniently(data: bytes, fault: Exception) -> ClientOp:
     if nonfinite.may_hold_literals(data):
         marked = nonfinite.mark_fields(data, _BODIES)
         if marked is not None:
@@ -237,18 +257,18 @@ def _decode_as_meant(data: bytes, fault: Exception) -> ClientOp:
                 return _decode(data)
             except jsontext.FAULTS as error:
                 fault = error
-    if any(words in str(fault) for words in _MAY_BE_MEANT):
+    if any(words in str(fault) for words in _TOLERATED_FAULTS):
         try:
-            return _decode(_as_meant(data))
+            return _decode(_without_nulls(data))
         except jsontext.FAULTS as error:
             fault = error
     raise jsontext.malformed(fault, ClientOp) from None
 
 
-def _as_meant(data: bytes) -> bytes:
-    """The same message without the fields that are null, for clients that write out what they leave open.
+def _without_nulls(data: bytes) -> bytes:
+    """The same message without the fields that are null: some clients write null for an omitted field.
 
-    Integers written as ``2.0`` become integers: some languages know no others.
+    Integers written as ``2.0`` become integers, as some languages have only floating-point numbers.
     """
     fields = msgspec.json.decode(data, type=dict[str, msgspec.Raw])
     kept = {
@@ -260,7 +280,7 @@ def _as_meant(data: bytes) -> bytes:
 
 
 def _integer(text: msgspec.Raw) -> Any:
-    """The integer a number stands for; any other text as it is."""
+    """The integer that a number equals; any other text unchanged."""
     try:
         number = msgspec.json.decode(text, type=float)
     except jsontext.FAULTS:
@@ -269,7 +289,7 @@ def _integer(text: msgspec.Raw) -> Any:
 
 
 class _Request(msgspec.Struct, frozen=True):
-    """What can be told of a message with a fault."""
+    """The fields that are read of a message that :func:`decode` refused."""
 
     op: msgspec.Raw = msgspec.Raw(b"null")
     id: msgspec.Raw = msgspec.Raw(b"null")
@@ -278,7 +298,7 @@ class _Request(msgspec.Struct, frozen=True):
 
 
 _LONGEST_WORD = 4 * KIB
-"""Bytes of a field that is read of a message with a fault."""
+"""Longest field, in bytes, that is read of a refused message."""
 
 
 class Unreadable(NamedTuple):
@@ -294,9 +314,12 @@ class Unreadable(NamedTuple):
 
 
 def unreadable(data: bytes) -> Unreadable:
-    """What can be read of a message that :func:`decode` refused; all is ``None`` of what is no JSON object."""
-    if nonfinite.may_hold_literals(data) and len(data) <= json_cost.LARGE and json_cost.excess(data) is None:
-        data = nonfinite.mark(data)
+    """Read what is possible of a message that :func:`decode` refused; nothing if it is no JSON object."""
+    if nonfinite.may_hold_literals(data):
+        with suppress(json_cost.TooCostly):
+            json_cost.check_literals(data)
+            json_cost.check(data)
+            data = nonfinite.mark(data)
     try:
         request = msgspec.json.decode(data, type=_Request)
     except jsontext.FAULTS:
@@ -313,7 +336,7 @@ def unreadable(data: bytes) -> Unreadable:
 
 
 def _word(text: msgspec.Raw) -> Any:
-    """A field of a message with a fault; ``None`` for one that is too long to be read."""
+    """A field of a refused message; ``None`` if it is too long to be read."""
     return msgspec.json.decode(text) if len(bytes(text)) <= _LONGEST_WORD else None
 
 

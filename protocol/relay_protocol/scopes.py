@@ -1,8 +1,8 @@
-"""Scopes: what a token may be used for, in the terms of rights, never more than its user may (RFC 6749 section 3.3).
+"""Scopes of tokens (RFC 6749 section 3.3). A token never allows more than its user's rights.
 
 A scope is a list of items separated by single spaces. An item is a level (``viewer``), or an operation on resources
 (``publish:/cmd_vel``), for all robots or, with ``@`` and a name or pattern, for some (``operator@cleaner-*``,
-``subscribe:/scan@rover``); or it is ``admin``, for what is no question of one robot.
+``subscribe:/scan@rover``); or it is ``admin``, for administration.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import NAME
-from relay_protocol.rights import Grant, Level, Operation, includes, needed, parse_pattern
-from relay_protocol.wildcards import see_cheap
+from relay_protocol.rights import Grant, Level, Operation, includes, parse_pattern, required_level
+from relay_protocol.wildcards import check_pattern
 
 ADMIN = "admin"
 
@@ -27,48 +27,51 @@ _TOKEN = re.compile(r"[\x21\x23-\x5b\x5d-\x7e]+\Z")
 
 
 class _Item(NamedTuple):
-    """One item but ``admin``.
+    """One item other than ``admin``.
 
-    :param robots: a shell pattern
+    :param permission: a level, or ``operation:resource``
+    :param robots: shell pattern
     """
 
-    what: str
+    permission: str
     robots: str
 
     @property
     def grant(self) -> Grant:
-        """The right it names."""
-        return Grant(None, (self.what,)) if ":" in self.what else Grant(Level(self.what))
+        """The equivalent right."""
+        return Grant(None, (self.permission,)) if ":" in self.permission else Grant(Level(self.permission))
 
     def within(self, other: _Item) -> bool:
-        """Whether the other is sure to cover all that this covers."""
-        return _narrower(self.robots, other.robots) and self._less(other)
+        """Whether the other certainly covers everything this covers; false when that is not obvious."""
+        return _pattern_within(self.robots, other.robots) and self._permission_within(other)
 
-    def _less(self, other: _Item) -> bool:
+    def _permission_within(self, other: _Item) -> bool:
         (own_operation, own_colon, own_resource), (operation, colon, resource) = (
-            self.what.partition(":"),
-            other.what.partition(":"),
+            self.permission.partition(":"),
+            other.permission.partition(":"),
         )
         if own_colon and colon:
-            return operation in ("*", own_operation) and _narrower(own_resource, resource)
+            return operation in ("*", own_operation) and _pattern_within(own_resource, resource)
         if colon:
             return False
         if own_colon:
-            return own_operation != "*" and includes(Level(other.what), needed(Operation(own_operation)))
-        return includes(Level(other.what), Level(self.what))
+            return own_operation != "*" and includes(
+                Level(other.permission), required_level(Operation(own_operation))
+            )
+        return includes(Level(other.permission), Level(self.permission))
 
 
 class Scope:
-    """What one token may be used for.
+    """The scope of one token.
 
-    :param text: as it is asked for, told and stored
-    :raises Invalid: no items, too many, or one that can't be read
+    :param text: as requested, shown and stored
+    :raises Invalid: no items, too many, or an unknown one
     """
 
     def __init__(self, text: str) -> None:
         items = list(dict.fromkeys(text.split(" ", ITEMS)))
         if len(items) > ITEMS:
-            raise Invalid(f"a scope may have {ITEMS} items")
+            raise Invalid(f"a scope has at most {ITEMS} items")
         self.admin = ADMIN in items
         """Whether it covers administration."""
         self._items = [_parse(each) for each in items if each != ADMIN]
@@ -78,16 +81,16 @@ class Scope:
         return self._text
 
     @property
-    def anywhere(self) -> bool:
-        """Whether it means the same in every realm: it names no robots, and covers no administration."""
+    def realm_independent(self) -> bool:
+        """Whether it means the same in every realm: no item names robots, and none is ``admin``."""
         return not self.admin and all(each.robots == "*" for each in self._items)
 
     def on(self, robot: str) -> tuple[Grant, ...]:
-        """What it covers on a robot; nothing where the token must not even show that there is one."""
+        """The rights it covers on a robot; empty when the token must not even disclose that the robot exists."""
         return tuple(grant for pattern, grant in self._compiled if pattern.match(robot))
 
     def within(self, other: Scope) -> bool:
-        """Whether each item is covered by one of the other, as those of a refreshed token must be (section 6)."""
+        """Whether every item is covered by one of the other, as in a refreshed token (RFC 6749 section 6)."""
         return self.admin <= other.admin and all(
             any(each.within(wider) for wider in other._items) for each in self._items
         )
@@ -97,8 +100,8 @@ class Scope:
         return [(re.compile(fnmatch.translate(each.robots)), each.grant) for each in self._items]
 
 
-def _narrower(pattern: str, other: str) -> bool:
-    """Whether all that a shell pattern matches is matched by another, as far as that is plain."""
+def _pattern_within(pattern: str, other: str) -> bool:
+    """Whether one shell pattern certainly matches only names the other matches; false when that is not obvious."""
     if other in ("*", pattern):
         return True
     return not _WILD.search(pattern) and fnmatch.fnmatchcase(pattern, other)
@@ -113,17 +116,17 @@ def _parse(text: str) -> _Item:
         raise Invalid(
             f"an item of a scope has at most {NAME} printable ASCII characters, no quotes and no backslash"
         )
-    what, at, robots = text.rpartition("@")
+    permission, at, robots = text.rpartition("@")
     if not at:
-        what, robots = text, "*"
+        permission, robots = text, "*"
     if not robots:
         raise Invalid(f"'{text}' names no robot after the @")
-    see_cheap(robots)
-    if ":" in what:
-        parse_pattern(what)
-    elif what not in [str(each) for each in Level]:
+    check_pattern(robots)
+    if ":" in permission:
+        parse_pattern(permission)
+    elif permission not in [str(each) for each in Level]:
         raise Invalid(
-            f"'{what}' is no scope; it is {ADMIN}, viewer, operator, owner or operation:resource, and may end in "
-            "@robot, as in operator@rover"
+            f"'{permission}' is not a scope; write {ADMIN}, viewer, operator, owner or operation:resource, with "
+            "@robot at the end if needed, as in operator@rover"
         )
-    return _Item(what, robots)
+    return _Item(permission, robots)

@@ -1,14 +1,14 @@
-"""What others wrote: whether it can be a name, and made harmless for logs and terminals."""
+"""Text from outside: check whether it can be a name, and escape it for logs and terminals."""
 
 from __future__ import annotations
 
 
-def inert(text: str, longest: int | None = None) -> str:
-    """Text with line breaks, control, bidirectional and other invisible characters written as escapes.
+def escape_unprintable(text: str, longest: int | None = None) -> str:
+    """Replace line breaks, control, bidirectional and other invisible characters by escapes.
 
-    Escape sequences would act on a terminal, line breaks would forge log lines.
+    Otherwise escape sequences would act on a terminal, and line breaks would forge log lines.
 
-    :param longest: characters after which it is cut
+    :param longest: most characters; longer text is cut
     """
     if longest is not None and len(text) > longest:
         text = text[:longest] + "…"
@@ -17,10 +17,10 @@ def inert(text: str, longest: int | None = None) -> str:
     return "".join(each if each.isprintable() else _escaped(each) for each in text)
 
 
-def legible(text: str) -> bool:
-    """Whether names may be written so: printable, and without U+FFFD, which stands for bytes that were no text.
+def is_printable(text: str) -> bool:
+    """Whether a name is printable and without U+FFFD, which replaces bytes that are not UTF-8.
 
-    Two names that differ in such bytes would look the same, and be the same.
+    Two names that differ only in such bytes would be equal.
     """
     return text.isprintable() and "\ufffd" not in text
 

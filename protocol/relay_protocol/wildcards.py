@@ -1,22 +1,24 @@
-"""Shell wildcards that somebody sends: what is made of them must cost little, as it is made where all are served."""
+"""Checks shell wildcards from outside, because compiling some of them takes long and blocks the reactor."""
 
 from __future__ import annotations
 
 from relay_protocol.errors import Invalid
 
-MOST = 16
-"""Wildcards of one pattern."""
+MAX_WILDCARDS = 16
+"""Most wildcards of one pattern."""
 
 
-def see_cheap(pattern: str) -> str:
-    """See that a pattern can be made ready in well under a millisecond, whatever it says.
+def check_pattern(pattern: str) -> str:
+    """Check that a pattern compiles in well under a millisecond, and return it.
 
-    Classes of characters beyond ASCII take the standard library's ``re`` up to a tenth of a second.
+    Character classes beyond ASCII take ``re`` up to 100 ms.
 
-    :raises Invalid: too many wildcards, or a class with characters that names do not have
+    :raises Invalid: too many wildcards, or a character class in a pattern beyond ASCII
     """
-    if sum(map(pattern.count, "*?[")) > MOST:
-        raise Invalid(f"'{pattern[:40]}' has over {MOST} wildcards (*, ? and [); write a simpler pattern")
+    if sum(map(pattern.count, "*?[")) > MAX_WILDCARDS:
+        raise Invalid(
+            f"'{pattern[:40]}' has over {MAX_WILDCARDS} wildcards (*, ? and [); write a simpler pattern"
+        )
     if "[" in pattern and not pattern.isascii():
         raise Invalid(f"'{pattern[:40]}' has a [ and characters beyond ASCII; use one without the other")
     return pattern

@@ -1,7 +1,7 @@
-"""What names stand for, asked of the system in threads of our own, of which no user has more than a few.
+"""Which addresses messages of users may go to: networks that are refused, and the resolver of host names.
 
-A name server that hangs holds a thread for as long as the system waits for it, however soon we give up; so a place is
-let go only when its thread is done, and who has none left waits for himself alone.
+Names are resolved by the system in threads of our own, a few of them for each user. A name server that hangs holds its
+thread for as long as the system waits, even if we give up earlier; it delays only lookups of the same user.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import Invalid, Unavailable
-from relay_server.alerts.message import Undelivered
+from relay_server.alerts.schemas import Undelivered
 from relay_server.common.database import BoundedThreadPool
 
 Address = IPv4Address | IPv6Address
@@ -50,31 +50,31 @@ SPECIAL_NETWORKS: tuple[Network, ...] = tuple(
         ),
     )
 )
-"""Not for everybody's use: IANA's registry of special-purpose IPv4 addresses (RFC 6890), and multicast."""
+"""IANA's registry of special-purpose IPv4 addresses (RFC 6890), and multicast."""
 
 UNICAST = IPv6Network("2000::/3")
-"""All of IPv6 that is given out to be reached from everywhere; what lies outside is special."""
+"""Global unicast addresses of IPv6 (RFC 4291, section 2.5.4); all others are special."""
 
 SPECIAL_6: tuple[Network, ...] = tuple(
     map(ip_network, ("2001::/23", "2001:db8::/32", "2002::/16", "2620:4f:8000::/48", "3fff::/20"))
 )
-"""Special within it: IANA's registry of special-purpose IPv6 addresses."""
+"""Special networks within :data:`UNICAST`: IANA's registry of special-purpose IPv6 addresses."""
 
 NAT64 = IPv6Network("64:ff9b::/96")
-"""Carries an IPv4 address in its last 32 bits (RFC 6052), by which it is judged."""
+"""Addresses with an IPv4 address in the last 32 bits (RFC 6052), by which they are judged."""
 
 
 def parse_networks(texts: Iterable[str]) -> tuple[Network, ...]:
-    """Networks as an administrator writes them.
+    """Parse networks as an administrator writes them.
 
-    :raises Invalid: one that is none
+    :raises Invalid: one is not a network
     """
     found = []
     for text in texts:
         try:
             found.append(ip_network(text.strip()))
         except ValueError:
-            raise Invalid(f"'{text}' is no network; write 192.168.7.0/24 or fd00:7::/64") from None
+            raise Invalid(f"'{text}' is not a network; write 192.168.7.0/24 or fd00:7::/64") from None
     return tuple(found)
 
 
@@ -82,47 +82,44 @@ def parse_networks(texts: Iterable[str]) -> tuple[Network, ...]:
 class EgressPolicy:
     """Keeps messages out of networks that only the relay can reach.
 
-    :param attached: the networks that the relay's machine is in, asked whenever something is judged
-    :param also: networks that the administrator allows
-    :param never: networks that the administrator denies, also within those that are allowed
+    :param local: returns the networks that the relay's machine is in; they can change
+    :param allowed: special or local networks that the administrator allows
+    :param denied: networks that the administrator denies, even within those that are allowed
     """
 
-    attached: Callable[[], Collection[Network]]
-    also: tuple[Network, ...] = ()
-    never: tuple[Network, ...] = ()
+    local: Callable[[], Collection[Network]]
+    allowed: tuple[Network, ...] = ()
+    denied: tuple[Network, ...] = ()
 
-    def passed(self, texts: Iterable[str]) -> list[str]:
-        """Those of these addresses that may be connected to, in their order.
+    def permitted(self, addresses: Iterable[str]) -> list[str]:
+        """The addresses that may be connected to, in their order.
 
-        :raises Undelivered: nobody can say which networks the machine is in
+        :raises Undelivered: the system does not report the networks of the machine
         """
-        refused = self.attached()
-        return [each for each in texts if allowed(each, self.also, self.never, refused)]
+        local = self.local()
+        return [each for each in addresses if is_permitted(each, self.allowed, self.denied, local)]
 
 
-def allowed(
+def is_permitted(
     text: str,
-    also: Collection[Network] = (),
-    never: Collection[Network] = (),
-    attached: Collection[Network] = (),
+    allowed: Collection[Network] = (),
+    denied: Collection[Network] = (),
+    local: Collection[Network] = (),
 ) -> bool:
-    """Whether this address may be connected to.
+    """Whether an address may be connected to; see :class:`EgressPolicy`.
 
-    :param text: as the system's resolver gives it
-    :param also: networks that the administrator allows
-    :param never: networks that he denies
-    :param attached: networks that the machine is in
+    :param text: as the system's resolver returns it
     """
     try:
         address = ip_address(text)
     except ValueError:
         return False
-    address = _carried(address)
-    if _within(address, never):
+    address = _embedded_ipv4(address)
+    if _within(address, denied):
         return False
-    if _within(address, also):
+    if _within(address, allowed):
         return True
-    if _within(address, attached):
+    if _within(address, local):
         return False
     if isinstance(address, IPv4Address):
         return not any(address in network for network in SPECIAL_NETWORKS)
@@ -134,8 +131,8 @@ def _within(address: Address, networks: Iterable[Network]) -> bool:
     return any(address in network for network in networks if network.version == address.version)
 
 
-def _carried(address: Address) -> Address:
-    """The IPv4 address within an IPv6 one, where that is where it leads to."""
+def _embedded_ipv4(address: Address) -> Address:
+    """The IPv4 address that an IPv6 address leads to, else the address itself."""
     if isinstance(address, IPv6Address):
         if address.ipv4_mapped is not None:
             return address.ipv4_mapped
@@ -144,37 +141,37 @@ def _carried(address: Address) -> Address:
     return address
 
 
-LINK = 64
-"""A network of IPv6 has this prefix (RFC 4291, section 2.5.4), also where DHCPv6 gave the interface one address."""
+LINK_PREFIX = 64
+"""Prefix of an IPv6 network (RFC 4291, section 2.5.4), even if DHCPv6 gave the interface a single address."""
 
 WIDEST_4 = 8
 WIDEST_6 = 32
-"""An interface with more of the Internet on its cable than this is a tunnel's: only its own address counts."""
+"""An interface with a shorter prefix belongs to a tunnel, which carries everything: only its own address counts."""
 
 
 def local_networks() -> frozenset[Network]:
-    """The networks of all interfaces as they are now.
+    """The networks of all interfaces now.
 
-    :raises Undelivered: the system does not say
+    :raises Undelivered: the system does not report them
     """
     try:
         interfaces = psutil.net_if_addrs()
     except OSError as error:
-        # Under systemd, RestrictAddressFamilies must have AF_NETLINK for it.
-        words = f"the relay can't see which networks its machine is in, and sends nothing: {error}"
+        # Under systemd this needs AF_NETLINK in RestrictAddressFamilies.
+        words = f"the relay cannot see which networks its machine is in, and sends no messages: {error}"
         raise Undelivered(words, again=True) from None
     found: set[Network] = set()
     for addresses in interfaces.values():
         for each in addresses:
-            found.update(around(each.address, each.netmask, each.ptp))
+            found.update(networks_of(each.address, each.netmask, each.ptp))
     return frozenset(found)
 
 
-def around(address: str, netmask: str | None, peer: str | None = None) -> set[Network]:
-    """The networks that an address of an interface stands for; none where it is no IP address.
+def networks_of(address: str, netmask: str | None, peer: str | None = None) -> set[Network]:
+    """The networks of an interface's address; none if it is not an IP address.
 
-    :param address: as the system writes it, also with the interface's name behind a ``%``
-    :param netmask: as an address; ``None`` where the system knows none
+    :param address: as the system writes it, possibly with the interface's name after a ``%``
+    :param netmask: as an address; ``None`` if the system knows none
     :param peer: the other end of a point-to-point link
     """
     try:
@@ -182,7 +179,7 @@ def around(address: str, netmask: str | None, peer: str | None = None) -> set[Ne
     except ValueError:
         return set()
     found = {_network(own, own.max_prefixlen if netmask is None else _prefix(netmask))}
-    return found | around(peer, None) if peer else found
+    return found | networks_of(peer, None) if peer else found
 
 
 def _prefix(netmask: str) -> int:
@@ -192,17 +189,17 @@ def _prefix(netmask: str) -> int:
 def _network(own: IPv4Address | IPv6Address, prefix: int) -> Network:
     if isinstance(own, IPv4Address):
         return IPv4Network((own, prefix if prefix >= WIDEST_4 else own.max_prefixlen), strict=False)
-    return IPv6Network((own, min(prefix, LINK) if prefix >= WIDEST_6 else LINK), strict=False)
+    return IPv6Network((own, min(prefix, LINK_PREFIX) if prefix >= WIDEST_6 else LINK_PREFIX), strict=False)
 
 
-SECONDS = 5.0
+LOOKUP_SECONDS = 5.0
 THREADS = 16
 LOOKUPS = 2
-"""Names of one user that are looked up at a time."""
+"""Lookups of one user at a time."""
 
-WAITING = 64
+MAX_WAITING = 64
 
-SPECIAL_NAMES = "it is in a network that this relay does not send to"
+NOT_PERMITTED = "it is in a network that this relay does not send to"
 
 _log = Logger()
 
@@ -216,80 +213,83 @@ class NameResolver:
     def __init__(self, reactor: Any) -> None:
         self._reactor = reactor
         self._threads = BoundedThreadPool(
-            reactor, "alert-names", THREADS, WAITING, "too many names are looked up", only_reads=True
+            reactor, "alert-names", THREADS, MAX_WAITING, "too many names are looked up", only_reads=True
         )
-        self._places: dict[int, DeferredSemaphore] = {}
+        self._slots: dict[int, DeferredSemaphore] = {}
 
     def start(self) -> None:
         """Start the first thread."""
         self._threads.start()
 
     def stop(self) -> None:
-        """Finish what is under way; blocks for as long as that takes."""
+        """Finish running lookups; blocks until they have ended."""
         self._threads.stop()
 
     async def addresses(self, host: str, port: int, user: int) -> list[str]:
-        """All addresses of a host, each once; an address stands for itself, and nobody is asked.
+        """All addresses of a host, each once. An address is returned as it is.
 
-        :param user: for whom: his lookups that hang are in nobody else's way
-        :raises Undelivered: there are none, or nobody says so in time
+        :param user: number of the user; each has a few lookups at a time
+        :raises Undelivered: there is none, or no answer came in time
         """
         literal = _literal(host)
         if literal is not None:
             return [literal]
-        asked = Deferred.fromCoroutine(self._look_up(host, port, user))
+        lookup = Deferred.fromCoroutine(self._look_up(host, port, user))
         try:
-            return await asked.addTimeout(SECONDS, self._reactor)
+            return await lookup.addTimeout(LOOKUP_SECONDS, self._reactor)
         except (OSError, UnicodeError, DeferTimeout, Unavailable):
-            raise unreachable(host, "nobody knows an address of it now") from None
+            raise unreachable(host, "no address was found") from None
 
     async def _look_up(self, host: str, port: int, user: int) -> list[str]:
-        places = self._places.setdefault(user, DeferredSemaphore(LOOKUPS))
+        slots = self._slots.setdefault(user, DeferredSemaphore(LOOKUPS))
         try:
-            await places.acquire()
-            # Whoever waits may give up: that leaves the thread at work, and its place taken.
+            await slots.acquire()
+            # The caller may give up while the thread goes on, so the slot is released when the thread has ended.
             answer: Deferred[list[str]] = Deferred()
-            looking = Deferred.fromCoroutine(self._threads.run(_ask, host, port))
-            looking.addBoth(self._looked, places, user, answer)
+            running = Deferred.fromCoroutine(self._threads.run(_resolve, host, port))
+            running.addBoth(self._resolved, slots, user, answer)
             return await answer
         finally:
-            self._tidy(places, user)
+            self._drop_unused(slots, user)
 
-    def _looked(self, result: Any, places: DeferredSemaphore, user: int, answer: Deferred[list[str]]) -> None:
-        places.release()
-        self._tidy(places, user)
+    def _resolved(
+        self, result: Any, slots: DeferredSemaphore, user: int, answer: Deferred[list[str]]
+    ) -> None:
+        slots.release()
+        self._drop_unused(slots, user)
         if isinstance(result, Failure):
             answer.errback(result)
         else:
             answer.callback(result)
 
-    def _tidy(self, places: DeferredSemaphore, user: int) -> None:
-        if places.tokens == places.limit and self._places.get(user) is places:
-            del self._places[user]
+    def _drop_unused(self, slots: DeferredSemaphore, user: int) -> None:
+        if slots.tokens == slots.limit and self._slots.get(user) is slots:
+            del self._slots[user]
 
 
 def unreachable(host: str, why: str) -> Undelivered:
-    """What people are told of a host that nothing can be sent to.
+    """The error of a host that no message can be sent to.
 
-    Of a name only the log knows which it is: names of the relay's own networks are nobody else's business.
+    For a name it does not say whether the name is unknown or not permitted: users must not learn names of the relay's
+    own networks. The log has the reason.
 
     :param why: for the log
     """
     if _literal(host) is not None:
-        return Undelivered(f"{host}: {SPECIAL_NAMES}; its administrator can allow that", again=False)
-    _log.info("nothing can be sent to '{host}': {why}", host=host, why=why)
-    words = f"nobody knows an address of '{host}' now, or {SPECIAL_NAMES}; its administrator can allow that"
+        return Undelivered(f"{host}: {NOT_PERMITTED}; its administrator can allow that", again=False)
+    _log.info("no message can be sent to '{host}': {why}", host=host, why=why)
+    words = f"no address of '{host}' was found, or {NOT_PERMITTED}; its administrator can allow that"
     return Undelivered(words, again=True)
 
 
 def _literal(host: str) -> str | None:
-    """An address as the system would write it."""
+    """The normal form of an address; ``None`` for a name."""
     try:
         return str(ip_address(host))
     except ValueError:
         return None
 
 
-def _ask(host: str, port: int) -> list[str]:
+def _resolve(host: str, port: int) -> list[str]:
     found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     return list(dict.fromkeys(str(each[4][0]) for each in found))

@@ -1,35 +1,34 @@
-"""What the relay sees for itself: who is away, whose battery is low, who is stopped, which topics have ceased.
+"""Alerts that the relay raises itself: offline robots, low batteries, stops, and topics that have ceased.
 
-It looks again and again instead of counting on events: a state that lasts can't be missed.
+Robots are polled, so that no lasting state is missed by a lost event.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
 from relay_server.alerts import types as kinds
-from relay_server.channels.channel import Channel
-from relay_server.channels.channels import Channels
+from relay_server.channels.channel import Channel, Channels
 from relay_server.control.controllers import Controllers
 from relay_server.robots.registry import RobotRegistry, RobotState
 
 REGULAR_SECONDS = 10.0
-"""What has come for so long without a gap is expected to go on."""
+"""A topic is watched after so long without a gap."""
 
-SAMPLES = 5
-"""Fewest samples from which the usual period is known."""
+MIN_SAMPLES = 5
+"""Fewest samples from which a period is known."""
 
-PERIOD = 1.0
-"""Longest usual period of what is watched, seconds: what comes more seldom may be meant to."""
+MAX_PERIOD = 1.0
+"""Longest period of watched topics, in seconds; slower topics may pause on purpose."""
 
 GAP_SECONDS = 2.5
-"""A pause that is no gap yet: looks are a second apart."""
+"""Longest pause that is no gap; checks are a second apart."""
 
-PERIODS = 5.0
-LEAST_SECONDS = 3.0
-"""A topic has ceased when for so many of its periods, and for so long, nothing came."""
+STALE_PERIODS = 5.0
+STALE_SECONDS = 3.0
+"""A topic has ceased when no sample came for this many of its periods, and for this time."""
 
 
 class TopicWatch:
@@ -47,12 +46,12 @@ class TopicWatch:
         self._since = self._grown = now
 
     @property
-    def came(self) -> bool:
-        """Whether anything has come since this began."""
+    def has_samples(self) -> bool:
+        """Whether samples have come since this began."""
         return self._count > self._base
 
-    def grows(self, count: int) -> bool:
-        """Whether something has come since the last look.
+    def has_new(self, count: int) -> bool:
+        """Whether samples have come since the last check.
 
         :param count: samples that have come so far
         """
@@ -60,25 +59,25 @@ class TopicWatch:
 
     @property
     def period(self) -> float | None:
-        """Seconds from one sample to the next, where that is known and regular."""
+        """The period in seconds, if it is known and regular."""
         lasted, samples = self._grown - self._since, self._count - self._base
-        if lasted < REGULAR_SECONDS or samples < SAMPLES or lasted > samples * PERIOD:
+        if lasted < REGULAR_SECONDS or samples < MIN_SAMPLES or lasted > samples * MAX_PERIOD:
             return None
         return lasted / samples
 
     def excuse(self, now: float) -> None:
-        """Nothing could have come since the last look: that time does not count.
+        """Leave out the time since the last check, in which no sample could come.
 
-        :param now: not before the last look
+        :param now: not before the last check
         """
         if not self.stale:
             self._since += now - self._grown
             self._grown = now
 
-    def look(self, now: float, count: int) -> bool:
-        """See how many samples have come; whether the topic is stale.
+    def update(self, now: float, count: int) -> bool:
+        """Count samples; returns whether the topic is stale.
 
-        :param now: not before the last look
+        :param now: not before the last check
         """
         if count != self._count:
             if self.stale or now - self._grown > GAP_SECONDS:
@@ -86,55 +85,55 @@ class TopicWatch:
             self._count, self._grown, self.stale = count, now, False
         elif not self.stale:
             period = self.period
-            self.stale = period is not None and now - self._grown > max(LEAST_SECONDS, PERIODS * period)
+            self.stale = period is not None and now - self._grown > max(STALE_SECONDS, STALE_PERIODS * period)
         return self.stale
 
 
-LOOK_SECONDS = 0.25
-"""How often robots are looked at."""
+CHECK_SECONDS = 0.25
+"""Pause between two checks of robots."""
 
 STALL_SECONDS = 1.5
-"""After so long without a look the relay itself stood still: what came meanwhile is not read yet."""
+"""After so long without a check the relay itself stood still, and has not read yet what arrived meanwhile."""
 
 CLOCKS_SECONDS = 1.0
-"""How far two clocks may be apart that tell the same."""
+"""Largest difference between the two clocks of one duration."""
 
 BATTERY_STEP = 0.05
-"""The charge has to be so much above the threshold for a low battery to be over."""
+"""The alert ends when the charge is so much above the threshold."""
 
-UNSURE = 2 / 3
-"""A robot that was silent for this part of what makes it offline may be away: its topics' pauses don't count then."""
+MAYBE_OFFLINE = 2 / 3
+"""After this part of the silence that makes a robot offline, pauses of its topics do not count."""
 
 SETTLED_SECONDS = 5.0
-"""What a robot has not said of itself for so long after it came, it does not say."""
+"""Time for a robot to report its state after it came online."""
 
 UNWATCHED = ("/rosout", "/parameter_events")
-"""Topics that come as there is something to say."""
+"""Topics without a regular rate."""
 
 _ACTION = "/_action/"
 
 
 class AlertSink(Protocol):
-    """Where it is told."""
+    """Takes the alerts."""
 
-    def tell(self, robot: RobotState, kind: str, about: str, level: str, text: str) -> None:
-        """Something is wrong."""
+    def raise_alert(self, robot: RobotState, kind: str, about: str, level: str, text: str) -> None:
+        """Raise an alert, or repeat it."""
 
-    def over(self, robot: RobotState, kind: str, about: str = "") -> None:
-        """It is well again."""
+    def end(self, robot: RobotState, kind: str, about: str = "") -> None:
+        """End an alert."""
 
-    def lasts(self, robot: RobotState, kind: str, about: str = "") -> str | None:
-        """The level of this alert while it lasts."""
+    def level_of(self, robot: RobotState, kind: str, about: str = "") -> str | None:
+        """The level of an open alert; ``None`` if it is not open."""
 
-    def lasting(self, robot: RobotState, kind: str) -> list[str]:
-        """What those of a kind that last are about."""
+    def parts_of(self, robot: RobotState, kind: str) -> list[str]:
+        """The parts of the open alerts of a kind."""
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When something is wrong.
+    """Limits for alerts.
 
-    :param silent: seconds without a sign of life after which a robot is offline
+    :param silent: seconds without a message after which a robot is offline
     :param battery_low: charge, 0 to 1; 0 is never, critical or not
     :param battery_critical: charge at which it is worse
     """
@@ -145,151 +144,161 @@ class Thresholds:
 
 
 class Monitors:
-    """Looks at all robots.
+    """Checks all robots.
 
-    :param desks: know of orders to stop that robots have not confirmed yet
-    :param voice: is told what lasts and what is over
+    :param controllers: know the stops that robots have not confirmed yet
+    :param sink: takes the alerts
+    :param leads: whether this relay raises the alerts about robots that are connected to no relay of the cluster
     """
 
     def __init__(
         self,
         registry: RobotRegistry,
         channels: Channels,
-        desks: Controllers,
+        controllers: Controllers,
         thresholds: Thresholds,
-        voice: AlertSink,
+        sink: AlertSink,
+        leads: Callable[[], bool] = lambda: True,
     ) -> None:
         self._registry = registry
         self._channels = channels
-        self._desks = desks
+        self._controllers = controllers
         self._thresholds = thresholds
-        self._voice = voice
+        self._sink = sink
+        self._leads = leads
         self._online: dict[int, tuple[str | None, float]] = {}
-        """Since when each robot has its registration, seconds of the monotonic clock."""
-        self._heard: dict[int, tuple[float | None, float]] = {}
-        """When each was seen, by the wall's clock, and when that was looked at first, by the monotonic one."""
-        self._looked: float | None = None
-        """When robots were looked at last, by the monotonic clock."""
-        self._unsure: set[int] = set()
-        """Robots that may be away."""
-        self._flows: dict[tuple[int, str, int], TopicWatch] = {}
+        """Session of each online robot, and the monotonic time of its beginning."""
+        self._last_seen: dict[int, tuple[float | None, float]] = {}
+        """When each robot was seen, by the wall clock, and when that was first noticed, by the monotonic one."""
+        self._checked_at: float | None = None
+        """The monotonic time of the last check."""
+        self._maybe_offline: set[int] = set()
+        """Robots that may be offline."""
+        self._watches: dict[tuple[int, str, int], TopicWatch] = {}
 
-    def look(self, now: float, wall: float) -> None:
-        """Look at links, batteries and stops.
+    def check(self, now: float, wall: float) -> None:
+        """Check links, batteries and stops.
 
         :param now: monotonic seconds
         :param wall: Unix time, seconds
         """
-        if self._looked is not None and now - self._looked >= STALL_SECONDS:
-            self._forgive(now)
-        self._looked = now
+        if self._checked_at is not None and now - self._checked_at >= STALL_SECONDS:
+            self._excuse_stall(now)
+        self._checked_at = now
         for robot in self._registry:
             self._presence(robot, now, wall)
             self._battery(robot)
             self._stop(robot, now)
 
-    def look_at_topics(self, now: float) -> None:
-        """See which topics have ceased; about once a second."""
-        flows: dict[tuple[int, str, int], TopicWatch] = {}
+    def check_topics(self, now: float) -> None:
+        """Check which topics have ceased; to be called about once a second."""
+        watches: dict[tuple[int, str, int], TopicWatch] = {}
         for channel in self._channels:
-            flows.update(self._topics(channel, now))
-        self._flows = flows
+            watches.update(self._topics(channel, now))
+        self._watches = watches
         for robot in self._registry:
             self._end_stale(robot)
 
     # --- links, batteries, stops --------------------------------------------------------------------------
 
-    def _forgive(self, now: float) -> None:
-        """Robots that had a link before the relay stood still count as just heard, also if it was cut for that;
-        and what did not come meanwhile did not cease."""
+    def _excuse_stall(self, now: float) -> None:
+        """After the relay stood still: robots that had a link count as just seen, and topics have not ceased."""
         for robot_id in self._online:
-            self._heard[robot_id] = (self._heard.get(robot_id, (None, 0.0))[0], now)
-        for flow in self._flows.values():
-            flow.excuse(now)
+            self._last_seen[robot_id] = (self._last_seen.get(robot_id, (None, 0.0))[0], now)
+        for watch in self._watches.values():
+            watch.excuse(now)
 
     def _presence(self, robot: RobotState, now: float, wall: float) -> None:
-        if robot.control is None:
+        if robot.control_link is None:
             self._online.pop(robot.robot_id, None)
+            if robot.elsewhere:
+                robot.last_seen = wall
         elif self._online.get(robot.robot_id, (None, now))[0] != robot.session:
             self._online[robot.robot_id] = (robot.session, now)
         silence = self._silence(robot, now, wall)
         silent = silence >= self._thresholds.silent
-        if silence >= UNSURE * self._thresholds.silent:
-            self._unsure.add(robot.robot_id)
+        if silence >= MAYBE_OFFLINE * self._thresholds.silent:
+            self._maybe_offline.add(robot.robot_id)
         else:
-            self._unsure.discard(robot.robot_id)
-        if robot.control is not None and not silent:
-            self._voice.over(robot, kinds.OFFLINE)
-        elif silent and robot.last_seen is not None and self._voice.lasts(robot, kinds.OFFLINE) is None:
-            self._voice.tell(robot, kinds.OFFLINE, "", "error", "the robot is offline: nothing comes from it")
+            self._maybe_offline.discard(robot.robot_id)
+        if (robot.control_link is not None or robot.elsewhere) and not silent:
+            self._sink.end(robot, kinds.OFFLINE)
+        elif not silent or robot.last_seen is None or not (self._leads() or robot.control_link is not None):
+            return
+        elif self._sink.level_of(robot, kinds.OFFLINE) is None:
+            self._sink.raise_alert(
+                robot, kinds.OFFLINE, "", "error", "the robot is offline: no messages come from it"
+            )
 
     def _silence(self, robot: RobotState, now: float, wall: float) -> float:
-        """Seconds since the robot was heard; by the monotonic clock alone where the wall's was set meanwhile."""
+        """Seconds since the robot was seen; by the monotonic clock alone if the wall clock was set meanwhile."""
         seen = robot.last_seen
-        if self._heard.get(robot.robot_id, (None, 0.0))[0] != seen or seen is None:
-            self._heard[robot.robot_id] = (seen, now)
-        looked = now - self._heard[robot.robot_id][1]
-        exactly = looked if seen is None else wall - seen
-        return exactly if abs(exactly - looked) <= CLOCKS_SECONDS else looked
+        if self._last_seen.get(robot.robot_id, (None, 0.0))[0] != seen or seen is None:
+            self._last_seen[robot.robot_id] = (seen, now)
+        elapsed = now - self._last_seen[robot.robot_id][1]
+        by_wall_clock = elapsed if seen is None else wall - seen
+        return by_wall_clock if abs(by_wall_clock - elapsed) <= CLOCKS_SECONDS else elapsed
 
     def _battery(self, robot: RobotState) -> None:
         charge, at = robot.health.battery, self._thresholds
         if charge is None or not at.battery_low:
             return
         level = "error" if charge <= at.battery_critical else "warning" if charge <= at.battery_low else ""
-        lasts = self._voice.lasts(robot, kinds.BATTERY)
+        lasts = self._sink.level_of(robot, kinds.BATTERY)
         if level and (lasts is None or kinds.severity(level) > kinds.severity(lasts)):
-            self._voice.tell(robot, kinds.BATTERY, "", level, f"the battery is at {charge:.0%}")
+            self._sink.raise_alert(robot, kinds.BATTERY, "", level, f"the battery is at {charge:.0%}")
         elif lasts is not None and charge >= max(at.battery_low, at.battery_critical) + BATTERY_STEP:
-            self._voice.over(robot, kinds.BATTERY)
+            self._sink.end(robot, kinds.BATTERY)
 
     def _stop(self, robot: RobotState, now: float) -> None:
-        stopped = robot.safety.stopped or self._desks.standing(robot.robot_id).stopped
+        stopped = robot.motion_state.stopped or self._controllers.snapshot(robot.robot_id).stopped
         if stopped is not None:
-            if self._voice.lasts(robot, kinds.STOP) is None:
-                self._voice.tell(robot, kinds.STOP, "", "warning", stopped_by(stopped.by, stopped.why))
+            if self._sink.level_of(robot, kinds.STOP) is None:
+                self._sink.raise_alert(robot, kinds.STOP, "", "warning", stopped_by(stopped.by, stopped.why))
         elif now - self._online.get(robot.robot_id, ("", now))[1] > SETTLED_SECONDS:
-            self._voice.over(robot, kinds.STOP)
+            self._sink.end(robot, kinds.STOP)
 
     # --- topics -------------------------------------------------------------------------------------------
 
     def _topics(self, channel: Channel, now: float) -> Iterable[tuple[tuple[int, str, int], TopicWatch]]:
         robot = channel.robot
-        silent = {each.resource for each in robot.safety.inhibited}
+        silent = {each.resource for each in robot.motion_state.inhibited}
         silent.update(topic for topic, _ in channel.publications.active())
-        for each in channel.subscriptions.flows():
+        for each in channel.subscriptions.topic_rates():
             if not each.regular or each.topic in silent or _may_pause(robot, each.topic, each.type):
                 continue
             key = (robot.robot_id, each.topic, each.number)
-            flow = self._flows.get(key) or TopicWatch(now, each.taken)
-            was = flow.stale
-            if robot.robot_id in self._unsure and not flow.grows(each.taken):
-                flow.excuse(now)
-            elif flow.look(now, each.taken) and not was:
-                text = f"{each.topic} has come regularly, and comes no more"
-                self._voice.tell(robot, kinds.STALE, each.topic, "warning", text)
-            yield key, flow
+            watch = self._watches.get(key) or TopicWatch(now, each.received)
+            was = watch.stale
+            if robot.robot_id in self._maybe_offline and not watch.has_new(each.received):
+                watch.excuse(now)
+            elif watch.update(now, each.received) and not was:
+                text = f"{each.topic} came regularly and has stopped"
+                self._sink.raise_alert(robot, kinds.STALE, each.topic, "warning", text)
+            yield key, watch
 
     def _end_stale(self, robot: RobotState) -> None:
-        """Those are over that come again, and those nobody listens to; of a robot that is away nothing can be said."""
-        about = self._voice.lasting(robot, kinds.STALE) if robot.control is not None else []
+        """End alerts of topics that come again or have no subscription; an offline robot's alerts stay."""
+        about = self._sink.parts_of(robot, kinds.STALE) if robot.control_link is not None else []
         if not about:
             return
         channel = self._channels.find(robot)
         numbers = (
-            {} if channel is None else {each.topic: each.number for each in channel.subscriptions.flows()}
+            {}
+            if channel is None
+            else {each.topic: each.number for each in channel.subscriptions.topic_rates()}
         )
         for topic in about:
-            flow = self._flows.get((robot.robot_id, topic, numbers.get(topic, 0)))
-            if topic not in numbers or (flow is not None and flow.came and not flow.stale):
-                self._voice.over(robot, kinds.STALE, topic)
+            watch = self._watches.get((robot.robot_id, topic, numbers.get(topic, 0)))
+            if topic not in numbers or (watch is not None and watch.has_samples and not watch.stale):
+                self._sink.end(robot, kinds.STALE, topic)
 
 
 def _may_pause(robot: RobotState, topic: str, type_name: str) -> bool:
-    """Whether a topic comes as somebody does something: commands, logs, the insides of actions."""
+    """Whether a topic has no regular rate: commands, logs, topics of actions."""
     return topic in UNWATCHED or _ACTION in topic or robot.is_motion(topic, type_name)
 
 
-def stopped_by(who: str, why: str) -> str:
-    """In words for people."""
-    return f"stopped by {who}" + (f": {why}" if why else "")
+def stopped_by(user: str, why: str) -> str:
+    """The text of an alert about a stop."""
+    return f"stopped by {user}" + (f": {why}" if why else "")

@@ -1,12 +1,14 @@
-"""What people ask about alerts: what there is, who looks after it, by which rules they are told."""
+"""The rules of alerts for users: which alerts a user may list and acknowledge, and the user's own rules."""
 
 from __future__ import annotations
 
 import math
 import re
 import secrets
+import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
@@ -16,25 +18,29 @@ from twisted.logger import Logger
 from relay_db import queries
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.limits import HEARTBEATS_MISSED
 from relay_protocol.rights import Level, Rules
 from relay_server.access import Access, Principal
 from relay_server.alerts import rules
 from relay_server.alerts import types as kinds
-from relay_server.alerts.alerts import AlertHub
-from relay_server.alerts.message import view
+from relay_server.alerts.hub import AlertHub
+from relay_server.alerts.monitors import Thresholds
 from relay_server.alerts.rules import RuleRequest
+from relay_server.alerts.schemas import AlertInfo, RuleInfo, RuleList, RuleTest
 from relay_server.alerts.transports import Transports
+from relay_server.cluster.leadership import ALERTS
 from relay_server.common.database import AsyncDatabase
 from relay_server.common.token_bucket import TokenBucket
+from relay_server.core import Core
 from relay_server.events.bus import EventBus
 
-_FORM = re.compile(r"([0-9.e+-]{1,32})_([0-9A-Za-z]{1,32})\Z")
+_CURSOR = re.compile(r"([0-9.e+-]{1,32})_([0-9A-Za-z]{1,32})\Z")
 
 
 class AlertCursor(NamedTuple):
-    """An alert, by what lists are sorted by; it need not be there any more.
+    """A place in the list of alerts, which is sorted by these fields. The alert may be gone.
 
-    :param last: Unix seconds
+    :param last: Unix seconds of its latest report
     """
 
     last: float
@@ -45,51 +51,48 @@ class AlertCursor(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> AlertCursor:
-        """Read one again.
-
-        :raises Invalid: it is none
-        """
-        found = _FORM.match(text)
+        """:raises Invalid: not the text of a cursor"""
+        found = _CURSOR.match(text)
         try:
             last = math.nan if found is None else float(found[1])
         except ValueError:
             last = math.nan
         if found is None or not math.isfinite(last):
-            raise Invalid("'before' is what an earlier answer gave as 'next'")
+            raise Invalid("'before' must be the 'next' of an earlier answer")
         return cls(last, found[2])
 
 
-MOST = 500
-"""Alerts one answer holds."""
-
 PAGE = 500
-"""Rows that are looked through at once for alerts that somebody may know of."""
+"""Rows that one query reads."""
 
-REFUSED = 200
-"""Parts of robots that the database is told to leave out, because their alerts were seen to be none of his."""
+MAX_EXCLUDED = 200
+"""Parts of robots that queries leave out because their alerts are not for the user."""
 
 TESTS = (5 / 60, 5.0)
 CHANGES = (0.2, 20.0)
-"""Tests and changes of rules by one user: a second in the long run, and at once."""
+"""Tests and changes of rules by one user: per second in the long run, and at once."""
 
-REMEMBERED = 1000
-"""Users whose doings are counted, and whose pages' alerts are kept at a time."""
+MAX_USERS = 1000
+"""Users whose changes are counted, and whose shown alerts are cached."""
 
-NO_ALERT = "there is no such alert, or none for you"
+NO_ALERT = "there is no such alert, or you may not see it"
 
 
 class TooManyRuleChanges(Unavailable):
-    """Somebody does something too often; he may again after ``retry_after`` seconds."""
+    """A user changes or tests rules too often.
+
+    :ivar retry_after: seconds until the next is accepted
+    """
 
     code = "too_often"
 
-    def __init__(self, what: str, retry_after: float) -> None:
-        super().__init__(f"{what} too often; try again in {int(retry_after) + 1} s")
+    def __init__(self, action: str, retry_after: float) -> None:
+        super().__init__(f"{action} too often; try again in {int(retry_after) + 1} s")
         self.retry_after = retry_after
 
 
 class AlertService:
-    """Serves the HTTP API.
+    """Alerts and rules for users.
 
     :param seconds: a monotonic clock
     :param wall: Unix time in seconds
@@ -100,18 +103,18 @@ class AlertService:
     def __init__(
         self,
         alerts: AlertHub,
-        ways: Transports,
+        transports: Transports,
         store: AsyncDatabase,
         access: Access,
-        journal: EventBus,
+        bus: EventBus,
         seconds: Callable[[], float],
         wall: Callable[[], float],
     ) -> None:
         self._alerts = alerts
-        self._ways = ways
+        self._transports = transports
         self._store = store
         self._access = access
-        self._journal = journal
+        self._bus = bus
         self._seconds = seconds
         self._wall = wall
         self._buckets: OrderedDict[tuple[str, int], TokenBucket] = OrderedDict()
@@ -126,213 +129,256 @@ class AlertService:
         open: bool | None = None,
         limit: int = 100,
         before: AlertCursor | None = None,
-    ) -> list[dict[str, Any]]:
-        """Alerts the principal may know of, the latest first.
+    ) -> list[AlertInfo]:
+        """Alerts that the principal may see, the latest first.
 
-        :param robot: of this robot only
-        :param open: only those that last, or only those that are over
-        :param before: only those that come after this one in the list
+        :param robot: only of the robot of this name
+        :param open: only open ones, or only ended ones
+        :param before: only those behind this place of the list
         """
         rights = await self._rights(principal)
-        asked = [number for number, (name, _) in rights.items() if not robot or name == robot]
+        robots = [number for number, (name, _) in rights.items() if not robot or name == robot]
         await self._alerts.flush()
-        deaf = [each for each in asked if not rules.visible(rights[each][1], kinds.DIAGNOSTICS, "")]
-        found: list[dict[str, Any]] = []
-        refused: set[tuple[int, str, str]] = set()
+        without_diagnostics = [
+            each for each in robots if not rules.visible(rights[each][1], kinds.DIAGNOSTICS, "")
+        ]
+        found: list[AlertInfo] = []
+        excluded: set[tuple[int, str, str]] = set()
         after: tuple[float, str] | None = before
         while True:
             rows: list[AlertRecord] = await self._store.read(
                 queries.list_alerts,
-                asked,
+                robots,
                 open=open,
                 limit=PAGE,
                 after=after,
-                kinds_but={kinds.DIAGNOSTICS: deaf},
-                but=refused,
+                except_kinds={kinds.DIAGNOSTICS: without_diagnostics},
+                except_alerts=excluded,
             )
             for each in rows:
                 if rules.visible(rights[each.robot_id][1], each.kind, each.about):
-                    found.append(self._view(principal, each, rights[each.robot_id][1]))
-                elif len(refused) < REFUSED:
-                    refused.add((each.robot_id, each.kind, each.about))
+                    found.append(self._info(principal, each, rights[each.robot_id][1]))
+                elif len(excluded) < MAX_EXCLUDED:
+                    excluded.add((each.robot_id, each.kind, each.about))
             if len(rows) < PAGE or len(found) >= limit:
                 return found[:limit]
             after = rows[-1].last, rows[-1].id
 
     async def shown(self, principal: Principal) -> list[dict[str, Any]]:
-        """What a page of the principal shows now; the same list as long as it is the same."""
+        """The alerts that pages of the principal show now, as JSON objects; the same list while nothing changes."""
         known = await self._access.robots(principal)
         version = self._alerts.version
-        kept = self._pages.get(principal.user_id)
-        if kept is not None and kept[0] == version and kept[1] is known:
-            return kept[2]
+        cached = self._pages.get(principal.user_id)
+        if cached is not None and cached[0] == version and cached[1] is known:
+            return cached[2]
         rights = {record.id: each for record, each in known}
         found = [
             each
-            for each in self._alerts.book
+            for each in self._alerts.store
             if each.robot_id in rights and rules.visible(rights[each.robot_id], each.kind, each.about)
         ]
-        lasting = [each for each in found if each.over is None]
-        over = [each for each in found if each.over is not None]
-        over.sort(key=lambda each: each.over or 0.0, reverse=True)
-        over = over[: max(kinds.SHOWN_OVER, kinds.SHOWN - len(lasting))]
-        lasting.sort(key=lambda each: each.last, reverse=True)
-        chosen = sorted(over + lasting[: kinds.SHOWN - len(over)], key=lambda each: each.last, reverse=True)
-        shown = [self._view(principal, each, rights[each.robot_id]) for each in chosen]
-        if kept is not None and kept[2] == shown:
-            shown = kept[2]
+        shown: list[dict[str, Any]] = [
+            msgspec.to_builtins(self._info(principal, each, rights[each.robot_id])) for each in _chosen(found)
+        ]
+        if cached is not None and cached[2] == shown:
+            shown = cached[2]
         self._pages[principal.user_id] = (version, known, shown)
         self._pages.move_to_end(principal.user_id)
-        while len(self._pages) > REMEMBERED:
+        while len(self._pages) > MAX_USERS:
             self._pages.popitem(last=False)
         return shown
 
-    async def acknowledge(self, principal: Principal, alert_id: str) -> dict[str, Any]:
-        """The principal looks after it.
+    async def acknowledge(self, principal: Principal, alert_id: str) -> AlertInfo:
+        """Acknowledge an alert: the principal looks after it.
 
-        :raises NotFound: no such alert, or none the principal may know of
-        :raises Refused: only operators and owners may
+        :raises NotFound: no such alert, or the principal may not see it
+        :raises Refused: the principal is neither operator nor owner
         """
         rights = await self._rights(principal)
-        found = self._alerts.book.find(alert_id)
-        if not _concerns(found, rights):
-            # Also one of the book: how long it takes does not tell who has no right on its robot that it is there.
+        found = self._alerts.store.find(alert_id)
+        if not _is_visible(found, rights):
+            # Also if it is in memory: the time of the answer must not show a user without a right that it exists.
             found = await self._store.read(queries.get_alert, alert_id)
-        if found is None or not _concerns(found, rights):
+        if found is None or not _is_visible(found, rights):
             raise NotFound(NO_ALERT)
         mine = rights[found.robot_id][1]
-        if not _operates(mine):
-            raise Refused(f"to acknowledge alerts of {found.robot} takes the level operator")
+        if not _may_acknowledge(mine):
+            raise Refused(f"acknowledging alerts of {found.robot} needs the level operator")
         fresh = found.over is None and found.ack_at is None
         name = self._alerts.name_of(principal, found)
         found = self._alerts.acknowledge(alert_id, name, self._wall()) or found
         if fresh:
             await self._alerts.flush()
-            self._journal.event(
+            self._bus.publish(
                 "alert.acknowledged",
+                found.robot_id,
                 f"user:{name}",
-                cause=f"user:{principal.full}",
-                robot_id=found.robot_id,
-                user_id=principal.user_id,
                 alert=found.id,
                 alert_kind=found.kind,
             )
-        return self._view(principal, found, mine)
+        return self._info(principal, found, mine)
 
     async def _rights(self, principal: Principal) -> dict[int, tuple[str, Rules]]:
         return {record.id: (record.name, each) for record, each in await self._access.robots(principal)}
 
-    def _view(self, principal: Principal, alert: AlertRecord, rights: Rules) -> dict[str, Any]:
-        told = view(alert._replace(ack_by=_elsewhere(alert, principal.realm)))
-        return {
-            **told,
-            "may_acknowledge": alert.over is None and alert.ack_at is None and _operates(rights),
-            "news": alert.news,
-            "notify": self._alerts.tellers.shown(principal.user_id, alert, self._wall()),
-        }
+    def _info(self, principal: Principal, alert: AlertRecord, rights: Rules) -> AlertInfo:
+        return AlertInfo.of(
+            alert._replace(ack_by=_acknowledged_by(alert, principal.realm)),
+            may_acknowledge=alert.over is None and alert.ack_at is None and _may_acknowledge(rights),
+            notification_count=alert.notification_count,
+            notify=self._alerts.dispatcher.is_shown(principal.user_id, alert, self._wall()),
+        )
 
     # --- rules --------------------------------------------------------------------------------------------
 
-    async def rules(self, principal: Principal) -> dict[str, Any]:
-        """The principal's rules, and what a rule may say here."""
-        principal.needs_whole()
+    async def rules(self, principal: Principal) -> RuleList:
+        """The principal's rules, and the values that a rule may have here."""
+        principal.require_full_scope()
         found = await self._store.read(queries.list_alert_rules, principal.user_id)
-        return {
-            "rules": [self._rule(each) for each in found],
-            "kinds": list(kinds.KINDS),
-            "levels": list(kinds.LEVELS),
-            "channels": list(self._ways.channels),
-            "schemes": self._ways.schemes,
-        }
+        return RuleList(
+            rules=[self._rule(each) for each in found],
+            kinds=list(kinds.KINDS),
+            levels=list(kinds.LEVELS),
+            channels=list(self._transports.channels),
+            schemes=self._transports.schemes,
+        )
 
-    async def add_rule(self, principal: Principal, ask: RuleRequest, address: str) -> dict[str, Any]:
-        """Tell the principal of alerts from now on; the rule, with the secret if the relay made one.
+    async def add_rule(self, principal: Principal, request: RuleRequest, address: str) -> RuleInfo:
+        """Add a rule for the principal. The result has the secret if the relay made it.
 
-        :param address: from where this is asked
-        :raises Invalid: the rule makes no sense, or there are too many
-        :raises TooOften: so many changes in so short a time
+        :param address: the client's network address
+        :raises Invalid: the rule is not valid, or the principal has too many
+        :raises TooManyRuleChanges: the user changes rules too often
         """
-        principal.needs_whole()
+        principal.require_full_scope()
         self._count("change", principal, CHANGES, "you change rules")
-        rules.check(ask, self._ways.channels)
-        await self._ways.check(ask.channel, ask.url)
-        made = ask.channel == "webhook" and not ask.secret
+        rules.check(request, self._transports.channels)
+        await self._transports.check(request.channel, request.url)
+        made = request.channel == "webhook" and not request.secret
         if made:
-            ask = msgspec.structs.replace(ask, secret=secrets.token_urlsafe(32))
-        record = await self._store.write(_add, principal, ask, address, self._wall())
-        await self._take_up()
-        return {**self._rule(record), **({"secret": ask.secret} if made else {})}
+            request = msgspec.structs.replace(request, secret=secrets.token_urlsafe(32))
+        record = await self._store.write(_add, principal, request, address, self._wall())
+        await self._refresh()
+        rule = self._rule(record)
+        if made:
+            rule.secret = request.secret
+        return rule
 
     async def remove_rule(self, principal: Principal, number: int, address: str) -> None:
-        """Tell nobody by this rule any more.
-
-        :raises NotFound: the principal has none of this number
-        """
-        principal.needs_whole()
-        self._count("change", principal, CHANGES, "you change rules")
-        await self._store.write(_remove, principal, number, address, self._wall())
-        await self._take_up()
-
-    async def test_rule(self, principal: Principal, number: int) -> dict[str, Any]:
-        """Send a made-up alert now: whether it arrived, and why not.
+        """Remove a rule.
 
         :raises NotFound: the principal has no rule of this number
         """
-        principal.needs_whole()
+        principal.require_full_scope()
+        self._count("change", principal, CHANGES, "you change rules")
+        await self._store.write(_remove, principal, number, address, self._wall())
+        await self._refresh()
+
+    async def test_rule(self, principal: Principal, number: int) -> RuleTest:
+        """Send a test alert now.
+
+        :raises NotFound: the principal has no rule of this number
+        """
+        principal.require_full_scope()
         self._count("test", principal, TESTS, "you test rules")
         mine = await self._store.read(queries.list_alert_rules, principal.user_id)
         rule = next((each for each in mine if each.id == number), None)
         if rule is None:
             raise NotFound(_no_rule(number))
-        reason = await self._alerts.tellers.test(rule)
-        return {"ok": not reason, "reason": reason}
+        reason = await self._alerts.dispatcher.test(rule)
+        return RuleTest(ok=not reason, reason=reason)
 
-    async def _take_up(self) -> None:
-        """Have what was written count now. It was written: where that fails, the relay's next look does it."""
+    async def _refresh(self) -> None:
+        """Apply a change that was written. If this fails, the relay applies it at its next look at the database."""
         try:
             await self._alerts.refresh()
         except SwitchboardError as error:
-            self.log.warn("a change of rules for alerts counts later: {reason}", reason=str(error))
+            self.log.warn("a change of alert rules takes effect later: {reason}", reason=str(error))
 
-    def _count(self, what: str, principal: Principal, most: tuple[float, float], words: str) -> None:
+    def _count(self, what: str, principal: Principal, rate: tuple[float, float], action: str) -> None:
         bucket = self._buckets.setdefault(
-            (what, principal.user_id), TokenBucket(most[0], most[1], self._seconds)
+            (what, principal.user_id), TokenBucket(rate[0], rate[1], self._seconds)
         )
         self._buckets.move_to_end((what, principal.user_id))
-        while len(self._buckets) > REMEMBERED:
+        while len(self._buckets) > MAX_USERS:
             self._buckets.popitem(last=False)
         if not bucket.take():
-            raise TooManyRuleChanges(words, bucket.wait)
+            raise TooManyRuleChanges(action, bucket.wait)
 
-    def _rule(self, record: AlertRuleRecord) -> dict[str, Any]:
-        status = self._alerts.tellers.status(record.id)
-        return {
-            "id": record.id,
-            "label": record.label,
-            "robots": record.robots,
-            "kinds": list(record.kinds),
-            "level": record.level,
-            "channel": record.channel,
-            "url": rules.shown_url(record),
-            "over": record.over,
-            "group_s": record.group_s,
-            "quiet": record.quiet,
-            "status": {
-                "sent": status.sent,
-                "failed": status.failed,
-                "reason": status.reason,
-                "last": status.last,
-            },
-        }
+    def _rule(self, record: AlertRuleRecord) -> RuleInfo:
+        return RuleInfo(
+            id=record.id,
+            label=record.label,
+            robots=record.robots,
+            kinds=list(record.kinds),
+            level=record.level,
+            channel=record.channel,
+            url=rules.shown_url(record),
+            notify_end=record.notify_end,
+            group_s=record.group_s,
+            quiet=rules.quiet_hours(record),
+            status=self._alerts.dispatcher.status(record.id),
+        )
 
 
-def _concerns(alert: AlertRecord | None, rights: Mapping[int, tuple[str, Rules]]) -> bool:
-    """Whether there is an alert that somebody with these rights may know of."""
+class Alerts:
+    """The alerts of a relay: the hub with its transports, and the rules for users.
+
+    :ivar service: the rules for users
+    :raises Invalid: a network or scheme of the settings is not valid
+    """
+
+    def __init__(self, core: Core) -> None:
+        settings, own = core.settings, core.settings.alerts
+        self._transports = Transports(
+            core.reactor, time.time, own.webhook_networks, own.apprise_schemes, own.webhook_deny
+        )
+        self.hub = AlertHub(
+            core.reactor,
+            time.time,
+            core.database,
+            core.access,
+            core.robots,
+            core.channels,
+            core.controllers,
+            core.bus,
+            Thresholds(HEARTBEATS_MISSED * settings.heartbeat, own.battery_low, own.battery_critical),
+            self._transports.send,
+            self._transports.slot,
+            partial(core.leads, ALERTS),
+        )
+        self.service = AlertService(
+            self.hub, self._transports, core.database, core.access, core.bus, core.reactor.seconds, time.time
+        )
+
+    async def start(self, relay: str) -> None:
+        """Load the stored alerts, and check robots from now on.
+
+        :param relay: the relay's name, for messages
+        """
+        self._transports.start(relay)
+        await self.hub.start()
+
+    def mute(self, reason: str) -> None:
+        """Send nothing more: robots go offline because the relay stops."""
+        self.hub.mute()
+
+    async def save(self) -> None:
+        """Write the alerts, if the database takes them soon."""
+        await self.hub.save()
+
+    def join(self) -> None:
+        """End the threads; blocks until they have ended."""
+        self._transports.stop()
+
+
+def _is_visible(alert: AlertRecord | None, rights: Mapping[int, tuple[str, Rules]]) -> bool:
+    """Whether there is an alert, and a user with these rights may see it."""
     mine = None if alert is None else rights.get(alert.robot_id)
     return alert is not None and mine is not None and rules.visible(mine[1], alert.kind, alert.about)
 
 
-def _operates(rights: Rules) -> bool:
+def _may_acknowledge(rights: Rules) -> bool:
     return rights.level in (Level.OPERATOR, Level.OWNER)
 
 
@@ -340,7 +386,7 @@ def _no_rule(number: int) -> str:
     return f"you have no rule {number}"
 
 
-def keep(s: Session, user_id: int, ask: RuleRequest, now: float) -> AlertRuleRecord:
+def insert_rule(s: Session, user_id: int, request: RuleRequest, now: float) -> AlertRuleRecord:
     """Write a rule that was checked.
 
     :param now: Unix seconds
@@ -349,22 +395,22 @@ def keep(s: Session, user_id: int, ask: RuleRequest, now: float) -> AlertRuleRec
     return queries.add_alert_rule(
         s,
         user_id,
-        name=ask.label,
-        robots=ask.robots,
-        kinds=ask.kinds,
-        level=ask.level,
-        channel=ask.channel,
-        url=ask.url,
-        secret=ask.secret,
-        over=ask.over,
-        group_s=ask.group_s,
-        quiet=None if ask.quiet is None else msgspec.to_builtins(ask.quiet),
+        label=request.label,
+        robots=request.robots,
+        kinds=request.kinds,
+        level=request.level,
+        channel=request.channel,
+        url=request.url,
+        secret=request.secret,
+        notify_end=request.notify_end,
+        group_s=request.group_s,
+        quiet=None if request.quiet is None else msgspec.to_builtins(request.quiet),
         created=now,
     )
 
 
-def _add(s: Session, principal: Principal, ask: RuleRequest, address: str, now: float) -> AlertRuleRecord:
-    record = keep(s, principal.user_id, ask, now)
+def _add(s: Session, principal: Principal, request: RuleRequest, address: str, now: float) -> AlertRuleRecord:
+    record = insert_rule(s, principal.user_id, request, now)
     _audit(s, "alert_rule.add", principal, record, address, now)
     return record
 
@@ -390,7 +436,19 @@ def _audit(
     )
 
 
-def _elsewhere(alert: AlertRecord, realm: str) -> str | None:
-    """Who looks after an alert, as a realm is told: it may be from before the robot was shared with that."""
+def _acknowledged_by(alert: AlertRecord, realm: str) -> str | None:
+    """The user who acknowledged an alert, as users of a realm see the name: with its realm if that is another one.
+
+    The name may be stored without a realm, from before the robot was shared.
+    """
     by = alert.ack_by
     return by if by is None or "@" in by or realm == alert.realm else f"{by}@{alert.realm}"
+
+
+def _chosen(alerts: Iterable[AlertRecord]) -> list[AlertRecord]:
+    """The alerts that pages show, the latest first."""
+    found = list(alerts)
+    lasting = sorted((each for each in found if each.over is None), key=lambda each: -each.last)
+    ended = sorted((each for each in found if each.over is not None), key=lambda each: -(each.over or 0.0))
+    ended = ended[: max(kinds.MAX_SHOWN_OVER, kinds.MAX_SHOWN - len(lasting))]
+    return sorted(ended + lasting[: kinds.MAX_SHOWN - len(ended)], key=lambda each: -each.last)

@@ -1,7 +1,7 @@
-"""All alerts that last, and those that were over a moment ago: what is told again joins what is there.
+"""All open alerts and those that ended recently; repeated reports join the alert that is there.
 
-Pure: no clock, no database. Who calls says what time it is, and takes what has changed to be written. What is shown
-to people has the wall clock's time, which may be set; how long something lasts is measured by the monotonic one.
+Pure: no clock, no database. Callers pass the time, and take the changed records to write them. Users see times of the
+wall clock, which may be set; durations are measured by the monotonic clock.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from relay_server.alerts import types as kinds
 from relay_server.alerts.types import AlertEvent
 
 Key = tuple[str, str]
-"""Kind and part: what makes two alerts of one robot the same."""
+"""Kind and part (``about``), by which two alerts of a robot are the same."""
 
-KEPT = 1000
-"""Most alerts of one robot that are remembered after they were over."""
+MAX_OVER = 1000
+"""Most ended alerts of a robot in memory."""
 
 
 class Moment(NamedTuple):
@@ -33,7 +33,7 @@ class Moment(NamedTuple):
     tick: float
 
     def ago(self, wall: float) -> float:
-        """When something was, by the monotonic clock; what seems to lie ahead is now.
+        """The monotonic time of a wall time; a future time counts as now.
 
         :param wall: Unix seconds, of an earlier relay
         """
@@ -41,7 +41,7 @@ class Moment(NamedTuple):
 
 
 class AlertChange(NamedTuple):
-    """Something worth telling."""
+    """A change that users are notified of."""
 
     alert: AlertRecord
     event: AlertEvent
@@ -49,18 +49,18 @@ class AlertChange(NamedTuple):
 
 @dataclass
 class _Marks:
-    """What is remembered of an alert beside its record; times by the monotonic clock.
+    """State of an alert beside its record; times by the monotonic clock.
 
-    :param since: it was told last, or it is over
-    :param news: people were told that it began or became worse
-    :param severity: how bad it was then
-    :param told: people know that it lasts
+    :param since: of the last report, or of the end
+    :param notified: of the last notification that it began or became worse
+    :param severity: of its level then
+    :param announced: users know that it lasts
     """
 
     since: float
-    news: float = -inf
+    notified: float = -inf
     severity: int = -1
-    told: bool = False
+    announced: bool = False
 
 
 @dataclass
@@ -76,77 +76,78 @@ class _Robot:
     tokens: float = kinds.BURST
     filled: float = 0.0
     full: int = 0
-    """Alerts that found no room since the flood began."""
+    """Alerts over the limits since the flood began."""
 
 
 class AlertStore:
     """Alerts by robot.
 
-    :param new_id: makes a fresh name for an alert
+    :param new_id: makes a new id
     """
 
     def __init__(self, new_id: Callable[[], str]) -> None:
         self.states = 0
-        """Another number whenever an alert begins, ends, becomes worse or is looked after, worth telling or not."""
+        """Counts each beginning, end, worsening and acknowledgement, with or without a notification."""
         self._new_id = new_id
         self._robots: dict[int, _Robot] = {}
         self._changed: dict[str, AlertRecord] = {}
 
     def __iter__(self) -> Iterator[AlertRecord]:
-        """All that are remembered."""
+        """All alerts in memory."""
         for robot in self._robots.values():
             yield from robot.open.values()
             yield from robot.over.values()
 
     def load(self, records: list[AlertRecord], now: Moment) -> None:
-        """Take up what an earlier relay kept. Of what is the same that which lasts counts, as when it was told.
+        """Load stored alerts. Of two that are the same the open one counts.
 
-        What is without news nobody was told of: it is told when it is told here again, or stays (:meth:`sweep`).
+        No user was notified of an alert with ``notification_count`` 0. It is announced when it is reported again or
+        stays open (:meth:`sweep`).
         """
         for each in sorted(records, key=lambda record: (record.over is None, record.last)):
             robot = self._robots.setdefault(each.robot_id, _Robot(filled=now.tick))
             key = (each.kind, each.about)
             (robot.open if each.over is None else robot.over)[key] = each
             marks = robot.marks[key] = _Marks(now.ago(each.last if each.over is None else each.over))
-            if each.news:
-                marks.news, marks.severity = now.ago(each.last), kinds.severity(each.level)
-                marks.told = each.over is None
+            if each.notification_count:
+                marks.notified, marks.severity = now.ago(each.last), kinds.severity(each.level)
+                marks.announced = each.over is None
             if each.over is None:
                 robot.over.pop(key, None)
 
     def take_changed(self) -> list[AlertRecord]:
-        """What is to be written, each once."""
+        """The records to write, each once."""
         changed, self._changed = self._changed, {}
         return list(changed.values())
 
     def put_back(self, records: list[AlertRecord]) -> None:
-        """It could not be written; what has changed since counts."""
+        """Take back records that could not be written; newer changes win."""
         self._changed = {each.id: each for each in records} | self._changed
 
     def open_of(self, robot_id: int) -> list[AlertRecord]:
-        """Those of a robot that last."""
+        """The open alerts of a robot."""
         robot = self._robots.get(robot_id)
         return [] if robot is None else list(robot.open.values())
 
-    def lasts(self, robot_id: int, kind: str, about: str = "") -> AlertRecord | None:
-        """This alert, if it lasts."""
+    def find_open(self, robot_id: int, kind: str, about: str = "") -> AlertRecord | None:
+        """An alert, if it is open."""
         robot = self._robots.get(robot_id)
         return None if robot is None else robot.open.get((kind, about))
 
     def find(self, alert_id: str) -> AlertRecord | None:
-        """An alert by its name."""
+        """An alert by its id."""
         return next((each for each in self if each.id == alert_id), None)
 
-    def untell(self, alert_ids: Collection[str]) -> None:
-        """Nobody has heard of these after all: those that last are kept without news."""
+    def mark_unreported(self, alert_ids: Collection[str]) -> None:
+        """Reset these alerts, if open: their notifications have reached no user."""
         for robot in self._robots.values():
             for key, each in robot.open.items():
                 if each.id in alert_ids:
                     robot.marks[key] = _Marks(robot.marks[key].since)
-                    self._keep(robot, each._replace(news=0))
+                    self._put(robot, each._replace(notification_count=0))
 
-    def forget(self, robot_id: int) -> None:
-        """The robot was removed."""
+    def forget_robot(self, robot_id: int) -> None:
+        """Drop the alerts of a robot that was removed."""
         robot = self._robots.pop(robot_id, None)
         if robot is not None:
             for each in (*robot.open.values(), *robot.over.values()):
@@ -154,50 +155,50 @@ class AlertStore:
 
     # --- what happens -------------------------------------------------------------------------------------
 
-    def tell(
+    def report(
         self, robot_id: int, name: str, realm: str, kind: str, about: str, level: str, text: str, now: Moment
     ) -> list[AlertChange]:
-        """Something is wrong: it joins what is known of the same, or is a new alert.
+        """Report an alert: it joins the open or recent one of the same key, or is a new one.
 
         :param name: of the robot, in its realm
         """
         robot = self._robots.setdefault(robot_id, _Robot(filled=now.tick))
-        key, text = (kind, about), text[: kinds.TEXT]
+        key, text = (kind, about), text[: kinds.MAX_TEXT]
         before = robot.open.get(key)
         if before is not None:
-            return self._again(robot, before, level, text, now)
+            return self._repeat(robot, before, level, text, now)
         back = robot.over.get(key)
         if back is not None and now.tick - robot.marks[key].since < kinds.REJOIN_SECONDS:
-            return self._back(robot, back, level, text, now)
-        if kind != kinds.FLOOD and not _has_place(robot, key) and not self._room(robot, now):
+            return self._reopen(robot, back, level, text, now)
+        if kind != kinds.FLOOD and not _is_reserved(robot, key) and not self._take_token(robot, now):
             robot.full += 1
-            # Not what they say: whoever sees this may have no right to see them. But how bad it is.
-            words = f"{robot.full} more alerts of {name} are not kept one by one"
+            # Without their texts, which readers of this may have no right to see; but with the worst level.
+            words = f"{robot.full} more alerts of {name} are not listed one by one"
             worst = max(level, "warning", key=kinds.severity)
-            return self.tell(robot_id, name, realm, kinds.FLOOD, "", worst, words, now)
+            return self.report(robot_id, name, realm, kinds.FLOOD, "", worst, words, now)
         made = AlertRecord(
-            self._new_id(),
-            robot_id,
-            name,
-            realm,
-            kind,
-            about,
-            level,
-            text,
-            now.wall,
-            now.wall,
-            1,
-            1,
-            None,
-            None,
-            None,
+            id=self._new_id(),
+            robot_id=robot_id,
+            robot=name,
+            realm=realm,
+            kind=kind,
+            about=about,
+            level=level,
+            text=text,
+            first=now.wall,
+            last=now.wall,
+            report_count=1,
+            notification_count=1,
+            over=None,
+            ack_by=None,
+            ack_at=None,
         )
         robot.over.pop(key, None)
         robot.marks[key] = _Marks(now.tick)
-        return [self._news(robot, made, AlertEvent.BEGUN, now)]
+        return [self._announce(robot, made, AlertEvent.BEGUN, now)]
 
-    def over(self, robot_id: int, kind: str, about: str, now: Moment) -> list[AlertChange]:
-        """It is well again."""
+    def end(self, robot_id: int, kind: str, about: str, now: Moment) -> list[AlertChange]:
+        """End an alert."""
         robot = self._robots.get(robot_id)
         lasts = None if robot is None else robot.open.get((kind, about))
         return [] if robot is None or lasts is None else self._end(robot, lasts, now)
@@ -205,32 +206,32 @@ class AlertStore:
     def acknowledge(
         self, alert_id: str, by: str, at: float, now: Moment
     ) -> tuple[AlertRecord | None, list[AlertChange]]:
-        """Somebody looks after it; the alert, if there is one, and what that changes.
+        """Acknowledge an alert; returns it, if there is one, and the changes.
 
-        What nobody will tell the end of is over by it, also where that was kept while no relay ran.
+        Kinds without an end of their own end by it, also if it was written while no relay ran.
 
-        :param at: since when, Unix seconds
+        :param at: of the acknowledgement, Unix seconds
         """
         found = self.find(alert_id)
         if found is None or found.over is not None:
             return found, []
         robot = self._robots[found.robot_id]
         if found.ack_at is None:
-            found = self._keep(robot, found._replace(ack_by=by, ack_at=at))
+            found = self._put(robot, found._replace(ack_by=by, ack_at=at))
             self.states += 1
         changes = self._end(robot, found, now) if kinds.endless(found.kind) else []
         return self.find(alert_id), changes
 
     def sweep(self, now: Moment) -> list[AlertChange]:
-        """Tell what came back and stayed; end what nobody tells the end of; forget what was over long ago."""
+        """Announce alerts that came back and stayed, end those without an end of their own, drop old ones."""
         changes: list[AlertChange] = []
         for robot_id, robot in list(self._robots.items()):
             for key, each in list(robot.open.items()):
                 marks = robot.marks[key]
-                if now.tick - marks.since >= _patience(each.kind):
+                if now.tick - marks.since >= _timeout(each.kind):
                     changes += self._end(robot, each, now)
-                elif not marks.told:
-                    changes += self._come_back(robot, each, now)
+                elif not marks.announced:
+                    changes += self._announce_return(robot, each, now)
             _forget_old(robot, now)
             if not robot.open and not robot.over and now.tick - robot.filled > kinds.BURST / kinds.RATE:
                 del self._robots[robot_id]
@@ -238,44 +239,59 @@ class AlertStore:
 
     # --- how ----------------------------------------------------------------------------------------------
 
-    def _again(
+    def _repeat(
         self, robot: _Robot, before: AlertRecord, level: str, text: str, now: Moment
     ) -> list[AlertChange]:
         marks = robot.marks[before.kind, before.about]
         marks.since = now.tick
         worse = kinds.severity(level) > kinds.severity(before.level)
         now_it_is = before._replace(
-            text=text, level=level if worse else before.level, last=now.wall, times=before.times + 1
+            text=text,
+            level=level if worse else before.level,
+            last=now.wall,
+            report_count=before.report_count + 1,
         )
         if not worse:
-            same = self._keep(robot, now_it_is)
-            return [] if marks.told else self._come_back(robot, same, now)
+            same = self._put(robot, now_it_is)
+            return [] if marks.announced else self._announce_return(robot, same, now)
         self.states += 1
-        fresh = self._keep(robot, now_it_is._replace(ack_by=None, ack_at=None))
-        if not marks.told:
-            return self._come_back(robot, fresh, now)
-        return [self._news(robot, fresh._replace(news=before.news + 1), AlertEvent.WORSE, now)]
+        fresh = self._put(robot, now_it_is._replace(ack_by=None, ack_at=None))
+        if not marks.announced:
+            return self._announce_return(robot, fresh, now)
+        return [
+            self._announce(
+                robot, fresh._replace(notification_count=before.notification_count + 1), AlertEvent.WORSE, now
+            )
+        ]
 
-    def _back(
+    def _reopen(
         self, robot: _Robot, before: AlertRecord, level: str, text: str, now: Moment
     ) -> list[AlertChange]:
         del robot.over[before.kind, before.about]
         robot.marks[before.kind, before.about].since = now.tick
         back = before._replace(
-            level=level, text=text, last=now.wall, times=before.times + 1, over=None, ack_by=None, ack_at=None
+            level=level,
+            text=text,
+            last=now.wall,
+            report_count=before.report_count + 1,
+            over=None,
+            ack_by=None,
+            ack_at=None,
         )
         self.states += 1
-        return self._come_back(robot, self._keep(robot, back), now)
+        return self._announce_return(robot, self._put(robot, back), now)
 
-    def _come_back(self, robot: _Robot, back: AlertRecord, now: Moment) -> list[AlertChange]:
-        """Tell of it, unless people were told of it a moment ago, and as bad."""
+    def _announce_return(self, robot: _Robot, back: AlertRecord, now: Moment) -> list[AlertChange]:
+        """Announce an alert, unless it was announced recently with the same or a worse level."""
         marks = robot.marks[back.kind, back.about]
         event = AlertEvent.BEGUN
-        if now.tick - marks.news < kinds.NEWS_SECONDS:
+        if now.tick - marks.notified < kinds.NEWS_SECONDS:
             if kinds.severity(back.level) <= marks.severity:
                 return []
             event = AlertEvent.WORSE
-        return [self._news(robot, back._replace(news=back.news + 1), event, now)]
+        return [
+            self._announce(robot, back._replace(notification_count=back.notification_count + 1), event, now)
+        ]
 
     def _end(self, robot: _Robot, lasts: AlertRecord, now: Moment) -> list[AlertChange]:
         key = (lasts.kind, lasts.about)
@@ -283,46 +299,48 @@ class AlertStore:
         if lasts.kind == kinds.FLOOD:
             robot.full = 0
         marks = robot.marks[key]
-        told, marks.told, marks.since = marks.told, False, now.tick
-        robot.over[key] = over = lasts._replace(over=now.wall, news=lasts.news + told)
+        announced, marks.announced, marks.since = marks.announced, False, now.tick
+        robot.over[key] = over = lasts._replace(
+            over=now.wall, notification_count=lasts.notification_count + announced
+        )
         self._changed[over.id] = over
         self.states += 1
-        while len(robot.over) > KEPT:
+        while len(robot.over) > MAX_OVER:
             _forget(robot, next(iter(robot.over)))
-        # The end of what was told is told, however soon it came: nobody shall go on worrying.
-        return [AlertChange(over, AlertEvent.OVER)] if told else []
+        # The end of an announced alert is announced, however soon it comes.
+        return [AlertChange(over, AlertEvent.OVER)] if announced else []
 
-    def _news(self, robot: _Robot, alert: AlertRecord, event: AlertEvent, now: Moment) -> AlertChange:
+    def _announce(self, robot: _Robot, alert: AlertRecord, event: AlertEvent, now: Moment) -> AlertChange:
         self.states += 1
         marks = robot.marks[alert.kind, alert.about]
-        marks.news, marks.severity, marks.told = now.tick, kinds.severity(alert.level), True
-        return AlertChange(self._keep(robot, alert), event)
+        marks.notified, marks.severity, marks.announced = now.tick, kinds.severity(alert.level), True
+        return AlertChange(self._put(robot, alert), event)
 
-    def _keep(self, robot: _Robot, alert: AlertRecord) -> AlertRecord:
+    def _put(self, robot: _Robot, alert: AlertRecord) -> AlertRecord:
         robot.open[alert.kind, alert.about] = alert
         self._changed[alert.id] = alert
         return alert
 
     @staticmethod
-    def _room(robot: _Robot, now: Moment) -> bool:
+    def _take_token(robot: _Robot, now: Moment) -> bool:
         robot.tokens = min(kinds.BURST, robot.tokens + (now.tick - robot.filled) * kinds.RATE)
         robot.filled = now.tick
-        if len(robot.open) >= kinds.OPEN or robot.tokens < 1:
+        if len(robot.open) >= kinds.MAX_OPEN or robot.tokens < 1:
             return False
         robot.tokens -= 1
         return True
 
 
-def _has_place(robot: _Robot, key: Key) -> bool:
-    """Whether an alert needs no room among the others. What was over of late counts as well: else parts without end."""
+def _is_reserved(robot: _Robot, key: Key) -> bool:
+    """Whether the limits do not apply to an alert. Recent ended ones count, as parts could be endless."""
     kind = key[0]
     if kind not in kinds.RESERVED:
         return kind in kinds.SINGLE
     return sum(each[0] == kind and each != key for each in (*robot.open, *robot.over)) < kinds.RESERVE
 
 
-def _patience(kind: str) -> float:
-    """Seconds after which an alert that was not told again is over."""
+def _timeout(kind: str) -> float:
+    """Seconds without a report after which an alert ends."""
     if kind == kinds.FLOOD:
         return kinds.FLOOD_SECONDS
     return kinds.ENDLESS_SECONDS if kinds.endless(kind) else float("inf")
@@ -335,7 +353,6 @@ def _forget_old(robot: _Robot, now: Moment) -> None:
 
 
 def _forget(robot: _Robot, key: Key) -> None:
-    """What was over is remembered no more; what is known of the same while it lasts stays."""
     del robot.over[key]
     if key not in robot.open:
         del robot.marks[key]

@@ -1,4 +1,4 @@
-"""The vocabulary of alerts (SPEC section 1.10): kinds, levels, channels, limits. Imports nothing of ours."""
+"""The vocabulary of alerts (SPEC 1.10): kinds, levels, channels, limits. Imports nothing of ours."""
 
 from __future__ import annotations
 
@@ -16,62 +16,64 @@ ROBOT = "robot"
 FLOOD = "flood"
 AUDIT = "audit"
 KEY = "key"
+DEVICE = "device"
+FILES = "files"
 
-KINDS = (OFFLINE, BATTERY, DIAGNOSTICS, STOP, MODULE, CONTROL, STALE, ROBOT, FLOOD, AUDIT, KEY)
+KINDS = (OFFLINE, BATTERY, DIAGNOSTICS, STOP, MODULE, CONTROL, STALE, ROBOT, FLOOD, AUDIT, KEY, DEVICE, FILES)
 
-OURS = frozenset({OFFLINE, BATTERY, STOP, CONTROL, STALE, FLOOD, AUDIT, KEY})
-"""What only the relay tells: a robot's word of such a kind is one of kind :data:`ROBOT`."""
+RELAY_KINDS = frozenset({OFFLINE, BATTERY, STOP, CONTROL, STALE, FLOOD, AUDIT, KEY})
+"""Kinds that only the relay raises: an alert that a robot reports with such a kind is stored as :data:`ROBOT`."""
 
 SINGLE = frozenset({OFFLINE, BATTERY, STOP, CONTROL, AUDIT, KEY})
-"""What a robot can have one of at most: no flood of others hides it."""
+"""Kinds of which a robot has one alert at most; the limit of open alerts does not apply to them."""
 
 RESERVED = frozenset({MODULE})
 RESERVE = 16
-"""What a flood of others does not hide either, of so many parts: that a process has died, by which the robot is
-guarded, seen or reached."""
+"""The limit does not apply to this many alerts of these kinds either: the death of a process that guards the robot,
+shows it or connects it must not be lost among others."""
 
 LEVELS = ("info", "warning", "error")
-"""From the least to the worst."""
+"""From the mildest to the worst."""
 
 CHANNELS = ("portal", "webhook", "apprise")
 
-OPEN = 300
-"""Most alerts of one robot that last at a time."""
+MAX_OPEN = 300
+"""Open alerts of one robot."""
 
-BURST = OPEN
+BURST = MAX_OPEN
 RATE = 1.0
-"""New alerts of one robot: so many at once, and so many a second in the long run."""
+"""New alerts of one robot: at once, and per second in the long run."""
 
 REJOIN_SECONDS = 300.0
-"""What comes back within this time is the alert that was there before."""
+"""An alert that comes back within this time after its end is the same alert."""
 
 NEWS_SECONDS = 60.0
-"""What comes and goes is news no more often than this."""
+"""Shortest time between two notifications of an alert that comes and goes."""
 
 SHOWN_SECONDS = 600.0
-SHOWN = 100
-"""What is over is told to pages for so long, and so many alerts at most."""
+MAX_SHOWN = 100
+"""How long pages show an ended alert, and how many alerts they show."""
 
-SHOWN_OVER = 25
-"""So many of these are what was over last, however much lasts."""
+MAX_SHOWN_OVER = 25
+"""Ended alerts among these for which there is always room."""
 
 ENDLESS_SECONDS = 86400.0
-"""What nobody tells the end of is over so long after it was told last."""
+"""An alert without an end of its own ends so long after its last report."""
 
 FLOOD_SECONDS = 60.0
-"""A flood is over when so long nothing came that found no room."""
+"""A flood ends when no alert was over the limit for so long."""
 
-TEXT = 500
+MAX_TEXT = 500
 """Longest text of an alert, in characters."""
 
-KEPT_SECONDS = 90 * 86400.0
-"""What is over is kept in the table for so long."""
+RETENTION_SECONDS = 90 * 86400.0
+"""How long ended alerts stay in the database."""
 
 _KIND = re.compile(r"[a-z][a-z0-9_-]{0,31}\Z")
 
 
 class AlertEvent(str, enum.Enum):
-    """What has become of an alert, where that is worth telling."""
+    """A change of an alert that users are notified of."""
 
     BEGUN = "begun"
     WORSE = "worse"
@@ -79,22 +81,22 @@ class AlertEvent(str, enum.Enum):
 
 
 def endless(kind: str) -> bool:
-    """Whether alerts of this kind may have no end of their own: to acknowledge one ends it."""
+    """Whether alerts of this kind may have no end of their own; then acknowledging one ends it."""
     return kind in (CONTROL, ROBOT, AUDIT, KEY) or kind not in KINDS
 
 
 def from_robot(kind: str, about: str) -> tuple[str, str]:
-    """Under what kind and part a robot's own alert is filed."""
-    if kind in OURS or not _KIND.match(kind):
+    """The kind and part (``about``) under which a robot's own alert is stored."""
+    if kind in RELAY_KINDS or not _KIND.match(kind):
         return ROBOT, about or kind
     return kind, about
 
 
 def severity(level: str) -> int:
-    """How bad a level is. A word that is none counts as a warning: nothing a robot tells may get lost by it."""
+    """A level as a number, 0 is the mildest. An unknown level counts as a warning, so that no alert gets lost."""
     return LEVELS.index(level) if level in LEVELS else LEVELS.index("warning")
 
 
 def known_level(level: str) -> str:
-    """A level as it is kept."""
+    """The level, or ``warning`` if it is unknown."""
     return LEVELS[severity(level)]

@@ -1,7 +1,7 @@
-"""Messages to addresses that users chose, without a way into the networks of the relay.
+"""Sends messages to addresses that users chose, without giving access to the relay's own networks.
 
-A name is resolved here, all it stands for is judged, and the connection goes to the very address that was judged.
-No redirect is followed, no proxy is used, little of the answer is read.
+The name is resolved here, its addresses are judged, and the connection goes to exactly the address that was judged. No
+redirect is followed, no proxy is used, and only the status of the answer counts.
 """
 
 from __future__ import annotations
@@ -33,29 +33,32 @@ from relay_db.queries import AlertRuleRecord
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import KIB
-from relay_server.alerts.egress import SPECIAL_NAMES, EgressPolicy, unreachable
-from relay_server.alerts.message import NotificationMessage, Undelivered
+from relay_server.alerts.egress import NOT_PERMITTED, EgressPolicy, unreachable
+from relay_server.alerts.schemas import NotificationMessage, Undelivered
 
-SECONDS = 10.0
+SEND_SECONDS = 10.0
 CONNECT_SECONDS = 4.0
 ANSWER_BYTES = 64 * KIB
-"""What of an answer is read, head and all."""
+"""Most bytes of an answer that are read, headers included."""
 
-ADDRESSES = 3
+MAX_ADDRESSES = 3
 """Addresses of one name that are tried."""
 
-AGAIN = frozenset({408, 425, 429})
-"""Answers below 500 after which a message is sent again (RFC 9110, RFC 8470, RFC 6585)."""
+RETRIED_STATUSES = frozenset({408, 425, 429})
+"""Statuses below 500 after which a message is tried again (RFC 9110, RFC 8470, RFC 6585)."""
 
 _PRINTABLE = re.compile(r"[\x21-\x7e]+\Z")
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?\.?\Z")
 
 Resolve = Callable[[str, int, int], Awaitable[list[str]]]
-"""All addresses of a host and port, for a user. Raises :class:`Undelivered`."""
+"""Resolves a host and port for a user, see :meth:`NameResolver.addresses`."""
 
 
 class WebhookTarget(NamedTuple):
-    """Where a message goes."""
+    """A parsed address.
+
+    :param target: path and query
+    """
 
     tls: bool
     host: str
@@ -64,17 +67,17 @@ class WebhookTarget(NamedTuple):
 
     @property
     def url(self) -> str:
-        """Put together again, so that nobody reads it otherwise."""
+        """The address in its one form, so that no other parser can read it differently."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.tls else 'http'}://{host}:{self.port}{self.target}"
 
 
 def parse(url: str) -> WebhookTarget:
-    """Read the address of a webhook.
+    """Parse the address of a webhook.
 
-    :raises Invalid: it is none, in words
+    :raises Invalid: it is not one
     """
-    wrong = "a webhook's 'url' is https://host/path, in ASCII, without a user, a password or a fragment"
+    wrong = "a webhook's 'url' must be https://host/path, in ASCII, without a user, a password or a fragment"
     if not _PRINTABLE.match(url) or "\\" in url or "#" in url:
         raise Invalid(wrong)
     try:
@@ -90,79 +93,78 @@ def parse(url: str) -> WebhookTarget:
     tls = parts.scheme == "https"
     if tls and not _certifiable(host):
         raise Invalid(
-            "no certificate can be for the host of this webhook's 'url'; names have letters, digits and hyphens"
+            "no certificate can be valid for the host of this webhook's 'url'; use letters, digits and hyphens only"
         )
     query = f"?{parts.query}" if parts.query else ""
     return WebhookTarget(tls, host, port or (443 if tls else 80), (parts.path or "/") + query)
 
 
 def _certifiable(host: str) -> bool:
-    """Whether TLS knows hosts of this form (RFC 5890): there are names that the system resolves all the same."""
+    """Whether TLS accepts a host of this form (RFC 5890); the system resolves other names too."""
     try:
         optionsForClientTLS(host)
-    except ValueError:  # that of the idna package is one
+    except ValueError:  # also the base class of the idna package's error
         return False
     return True
 
 
 def signature(secret: str, timestamp: str, body: bytes) -> str:
-    """What proves to a receiver who knows the secret that the relay sent this body then."""
+    """The value of ``Switchboard-Signature``: proves who sent the body, and when, to a receiver that has the secret."""
     signed = timestamp.encode() + b"." + body
     return "v1=" + hmac.new(secret.encode(), signed, hashlib.sha256).hexdigest()
 
 
-class Webhooks:
+class WebhookTransport:
     """Sends messages as HTTP requests.
 
-    :param reactor: Twisted's
-    :param fence: says which addresses may be reached
+    :param policy: decides which addresses may be reached
     :param wall: Unix time in seconds
-    :param trust: whose certificates count; ``None`` for those the system trusts
+    :param trust: root certificates; ``None`` for those of the system
+    :ivar relay: the relay's name, for receivers
     """
 
     def __init__(
         self,
         reactor: Any,
         resolve: Resolve,
-        fence: EgressPolicy,
+        policy: EgressPolicy,
         wall: Callable[[], float],
         trust: Any = None,
     ) -> None:
         self._reactor = reactor
         self._resolve = resolve
-        self._fence = fence
+        self._policy = policy
         self.relay = ""
-        """Its name, for those who are told."""
         self._wall = wall
         self._trust = trust
 
     def check(self, url: str) -> None:
-        """Whether this can be the address of a webhook; what its name stands for is judged at each message.
+        """Check an address of a webhook. The addresses of its host are judged at each message.
 
-        :raises Invalid: it can't
+        :raises Invalid: it is not valid
         """
         parse(url)
 
     async def send(self, rule: AlertRuleRecord, message: NotificationMessage) -> None:
         """Deliver one message.
 
-        :raises Undelivered: it was not taken
+        :raises Undelivered: it was not accepted
         """
         try:
-            place = parse(rule.url)
+            target = parse(rule.url)
         except Invalid as error:
             raise Undelivered(str(error), again=False) from None
-        body = jsontext.encode(message.fields(self.relay, rule.id))
+        body = jsontext.encode(message.webhook(self.relay, rule.id))
         sending = Deferred.fromCoroutine(
-            self._send(place, rule.user_id, self._headers(rule, message, body), body)
+            self._send(target, rule.user_id, self._headers(rule, message, body), body)
         )
         try:
-            status = await sending.addTimeout(SECONDS, self._reactor)
+            status = await sending.addTimeout(SEND_SECONDS, self._reactor)
         except DeferTimeout:
-            raise Undelivered(f"{place.host} did not answer within {SECONDS:g} s", again=True) from None
+            raise Undelivered(f"{target.host} did not answer within {SEND_SECONDS:g} s", again=True) from None
         if not 200 <= status < 300:
-            again = status >= 500 or status in AGAIN
-            raise Undelivered(f"{place.host} answered with the status {status}", again=again)
+            again = status >= 500 or status in RETRIED_STATUSES
+            raise Undelivered(f"{target.host} answered with the status {status}", again=again)
 
     def _headers(self, rule: AlertRuleRecord, message: NotificationMessage, body: bytes) -> Headers:
         timestamp = str(int(self._wall()))
@@ -176,52 +178,52 @@ class Webhooks:
             }
         )
 
-    async def _send(self, place: WebhookTarget, user: int, headers: Headers, body: bytes) -> int:
-        """The status of the answer."""
-        found = await self._resolve(place.host, place.port, user)
-        good = self._fence.passed(found)
-        if not good:
-            raise unreachable(place.host, SPECIAL_NAMES)
-        for address in good[:ADDRESSES]:
-            endpoint = self._endpoint(place, address)
-            agent = Agent.usingEndpointFactory(self._reactor, _Straight(endpoint))
+    async def _send(self, target: WebhookTarget, user: int, headers: Headers, body: bytes) -> int:
+        """Send a request; returns the status of the answer."""
+        found = await self._resolve(target.host, target.port, user)
+        permitted = self._policy.permitted(found)
+        if not permitted:
+            raise unreachable(target.host, NOT_PERMITTED)
+        for address in permitted[:MAX_ADDRESSES]:
+            endpoint = self._endpoint(target, address)
+            agent = Agent.usingEndpointFactory(self._reactor, _FixedEndpoint(endpoint))
             try:
                 answer = await agent.request(
-                    b"POST", place.url.encode("ascii"), headers, FileBodyProducer(io.BytesIO(body))
+                    b"POST", target.url.encode("ascii"), headers, FileBodyProducer(io.BytesIO(body))
                 )
             except ConnectError:
                 continue
-            except Exception as error:  # what a peer does makes the client fail in many ways
-                raise _broken(place, error) from None
+            except Exception as error:  # a peer can make the client fail in many ways
+                raise _no_answer(target, error) from None
             finally:
-                # Also after an answer: what it says beside its status is not read.
+                # Also after an answer, since only its status is read.
                 endpoint.cut()
             return int(answer.code)
-        raise Undelivered(f"nobody answers at {place.host}, port {place.port}", again=True)
+        raise Undelivered(f"{target.host} does not accept connections on port {target.port}", again=True)
 
-    def _endpoint(self, place: WebhookTarget, address: str) -> _Frugal:
+    def _endpoint(self, target: WebhookTarget, address: str) -> _LimitedEndpoint:
         kind: Any = TCP6ClientEndpoint if ":" in address else TCP4ClientEndpoint
-        endpoint = kind(self._reactor, address, place.port, timeout=CONNECT_SECONDS)
-        if place.tls:
+        endpoint = kind(self._reactor, address, target.port, timeout=CONNECT_SECONDS)
+        if target.tls:
             trust = platformTrust() if self._trust is None else self._trust
-            endpoint = wrapClientTLS(optionsForClientTLS(place.host, trustRoot=trust), endpoint)
-        return _Frugal(endpoint)
+            endpoint = wrapClientTLS(optionsForClientTLS(target.host, trustRoot=trust), endpoint)
+        return _LimitedEndpoint(endpoint)
 
 
-def _broken(place: WebhookTarget, error: Exception) -> Exception:
-    """Why there is no answer, in words; or that nobody waits for it any more."""
+def _no_answer(target: WebhookTarget, error: Exception) -> Exception:
+    """The error for an answer that did not come; a cancelled request stays cancelled."""
     causes = [error, *(reason.value for reason in getattr(error, "reasons", ()))]
     if any(isinstance(each, (CancelledError, ConnectingCancelledError)) for each in causes):
         return CancelledError()
-    words = "hung up before it answered"
+    words = "closed the connection before it answered"
     if any(isinstance(each, (TlsError, VerificationError)) for each in causes):
-        words = "has no certificate for this name that the relay trusts, or speaks no TLS"
-    return Undelivered(f"{place.host} {words}", again=True)
+        words = "has no certificate for this name that the relay trusts, or does not speak TLS"
+    return Undelivered(f"{target.host} {words}", again=True)
 
 
 @implementer(IAgentEndpointFactory)
-class _Straight:
-    """To the address that was judged, whatever the URL says."""
+class _FixedEndpoint:
+    """Connects to the address that was judged, whatever the URL says."""
 
     def __init__(self, endpoint: Any) -> None:
         self._endpoint = endpoint
@@ -230,8 +232,8 @@ class _Straight:
         return self._endpoint
 
 
-class _Counted(ProtocolWrapper):
-    """A connection that is cut when too much comes."""
+class _LimitedConnection(ProtocolWrapper):
+    """A connection that is closed when more than :data:`ANSWER_BYTES` arrive."""
 
     _left = ANSWER_BYTES
 
@@ -245,8 +247,8 @@ class _Counted(ProtocolWrapper):
 
 
 @implementer(IStreamClientEndpoint)
-class _Frugal:
-    """An endpoint for one connection that takes little, and can be cut."""
+class _LimitedEndpoint:
+    """An endpoint for one connection, with a limit of received bytes."""
 
     def __init__(self, inner: Any) -> None:
         self._inner = inner
@@ -254,7 +256,7 @@ class _Frugal:
 
     def connect(self, factory: Any) -> Any:
         wrapping = WrappingFactory(factory)
-        wrapping.protocol = _Counted
+        wrapping.protocol = _LimitedConnection
         wrapping.noisy = factory.noisy = False
         return self._inner.connect(wrapping).addCallback(self._connected)
 

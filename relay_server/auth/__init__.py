@@ -1,1 +1,1 @@
-"""Who a client is: passwords, access tokens, tickets, login links, origins."""
+"""Authentication: passwords, access tokens, tickets, login links, origins."""

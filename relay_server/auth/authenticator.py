@@ -1,4 +1,4 @@
-"""Who is it? Passwords, access tokens, one-time login codes and tickets become a principal."""
+"""Passwords, access tokens, one-time login codes and tickets become a principal."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from twisted.logger import Logger
 from relay_db import queries
 from relay_db.models import NAME
 from relay_db.names import normalise
-from relay_protocol.errors import Refused, SwitchboardError, Unavailable
+from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
-from relay_protocol.realms import parted
+from relay_protocol.realms import split_name
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth import passwords
-from relay_server.auth.login_limiter import FAILURES_OF_ACCOUNT, LoginLimiter
+from relay_server.auth.account_limit import AccountLimit
+from relay_server.auth.login_limiter import LoginLimiter, TooManyTries, network_of
 from relay_server.auth.origins import Origins
 from relay_server.common.database import AsyncDatabase, BoundedThreadPool
 
@@ -28,45 +29,33 @@ __all__ = ["Authenticator", "BadCredentials", "TooManyTries", "named_realm", "se
 SESSION_SECONDS = 12 * 3600.0
 HASHING_THREADS = 2
 TICKETS = 10_000
-"""Tickets all users may have open; for a further one the user who has most gives his oldest."""
+"""Most open tickets of all users. A further one replaces the oldest ticket of the user with most tickets."""
 
 TICKETS_OF_ONE = 100
-"""Tickets one user may have open; a further one takes the place of the oldest."""
+"""Most open tickets of one user. A further one replaces the oldest."""
 
 NAMED = 2 * NAME + 1
-"""Characters of a name with its realm that are put on record of who could not log in."""
+"""Characters of a user's name and realm that enter the record of a failed login."""
 
 LOGINS_WAITING = 64
-"""Logins that wait for their password to be hashed; further ones are asked to come back."""
-
-
-class TooManyTries(SwitchboardError):
-    """Further tries are refused for ``retry_after`` seconds."""
-
-    code = "too_many_tries"
-
-    def __init__(self, retry_after: float) -> None:
-        super().__init__(
-            f"too many failed logins from your network, or of this account; try again in {int(retry_after) + 1} s"
-        )
-        self.retry_after = retry_after
+"""Most logins that wait for their password to be hashed; further ones are rejected."""
 
 
 @dataclass(frozen=True)
 class TicketPurpose:
-    """What a ticket opens.
+    """The purpose of a ticket.
 
-    :param video: what shows the robot's cameras; else its websocket
-    :param camera: with ``video``, this camera alone; empty for whatever the addresses show
+    :param video: cameras of the robot instead of its websocket
+    :param camera: with ``video``, only this camera; empty for any
     """
 
     robot: str
     video: bool = False
     camera: str = ""
 
-    def covers(self, asked: TicketPurpose) -> bool:
-        """Whether it is for what somebody asks for with it."""
-        return (self.robot, self.video) == (asked.robot, asked.video) and self.camera in ("", asked.camera)
+    def covers(self, other: TicketPurpose) -> bool:
+        """Whether a ticket for this purpose is good for another one."""
+        return (self.robot, self.video) == (other.robot, other.video) and self.camera in ("", other.camera)
 
 
 @dataclass(frozen=True)
@@ -78,9 +67,9 @@ class _Ticket:
 
 @dataclass(frozen=True)
 class LoginResult(Principal):
-    """Somebody who has just logged in, for whom a session may be opened.
+    """A user who has just logged in, for whom a session may be opened.
 
-    :param password_hash: what was stored then; a session is opened only while that is still so
+    :param password_hash: as it was stored then; the session is opened only if it still is
     """
 
     password_hash: str | None = field(default=None, repr=False)
@@ -105,44 +94,37 @@ class Authenticator:
         self._store = store
         self._seconds = seconds
         self._wall = wall
-        self._limiter = LoginLimiter(seconds, of_account=FAILURES_OF_ACCOUNT)
+        self._limiter = LoginLimiter(seconds)
+        self._account_limit = AccountLimit(store, wall)
         self._hashing = BoundedThreadPool(
             reactor,
             "passwords",
             HASHING_THREADS,
             LOGINS_WAITING,
-            "too many people log in now; try again",
+            "too many users are logging in now; try again",
             only_reads=True,
         )
         self._tickets: dict[str, _Ticket] = {}
 
     def start(self) -> None:
-        """Start the threads that hash passwords, and make ready for the first unknown user."""
+        """Start the threads that hash passwords, and prepare for the first unknown user."""
         self._hashing.start()
         Deferred.fromCoroutine(self._hashing.run(passwords.prepare)).addErrback(
-            lambda failure: self.log.failure("passwords can't be hashed", failure)
+            lambda failure: self.log.failure("passwords cannot be hashed now", failure)
         )
 
-    async def take_up(self) -> None:
-        """Remember from which networks people have logged in lately, as the audit log has it.
-
-        :raises Unavailable: the database does not answer
-        """
-        for account, address in await self._store.read(queries.recent_logins):
-            self._limiter.remember(account, address)
-
     def stop(self) -> None:
-        """Wait for the hashing under way and end its threads."""
+        """Wait for hashing in progress, and end the threads."""
         self._hashing.stop()
 
     async def password(self, user: str, password: str, address: str) -> LoginResult:
-        """Check a password; unknown users cost the same time as known ones.
+        """Check a password. Unknown users take as long as known ones.
 
-        :param user: ``toad@lab1``; without a realm one of the default one
-        :param address: where the ask comes from, for the limit on failures
-        :raises BadCredentials: unknown user, wrong password or disabled account: one and the same answer
-        :raises TooManyTries: judged before the password is hashed
-        :raises Unavailable: the database does not answer, or too many log in at once
+        :param user: ``toad@lab1``; a name without a realm belongs to the default realm
+        :param address: of the client, for the limit on failures
+        :raises BadCredentials: unknown user, wrong password or disabled account, with the same message
+        :raises TooManyTries: decided before the password is hashed
+        :raises Unavailable: the database does not answer, or too many users log in at once
         """
         wait = self._limiter.wait(user, address)
         if wait > 0:
@@ -150,30 +132,36 @@ class Authenticator:
         self._limiter.failed(user, address)
         try:
             return await self._password(user, password, address)
-        except Unavailable:
-            # Nothing was tried.
+        except (Unavailable, TooManyTries):
+            # No password was tried.
             self._limiter.forgive(user, address)
             raise
 
     async def _password(self, user: str, password: str, address: str) -> LoginResult:
-        record = await self._store.read(queries.find_user, *parted(user))
+        record = await self._store.read(queries.find_user, *split_name(user))
+        failure = await self._account_limit.count(user, None if record is None else record.id, address)
         stored = record.password_hash if record is not None and not record.disabled else None
-        right = await self._hashing.run(passwords.verify_password, password, stored)
+        try:
+            right = await self._hashing.run(passwords.verify_password, password, stored)
+        except Unavailable:
+            await self._account_limit.forgive(failure)
+            raise
         if record is None or not right:
             raise BadCredentials("user or password is wrong")
+        await self._account_limit.succeeded(failure, record.id, address)
         self._limiter.succeeded(user, address)
         return LoginResult(record.id, record.name, record.realm, record.admin, 0, None, password_hash=stored)
 
     async def new_hash(self, password: str) -> str:
-        """What may be stored of a new password.
+        """The hash to store for a new password.
 
         :raises Invalid: it breaks the rules
-        :raises Unavailable: too many are hashed now
+        :raises Unavailable: too many passwords are being hashed
         """
         return await self._hashing.run(passwords.hash_password, password)
 
     async def token(self, token: str) -> Principal:
-        """The principal behind an access token or a portal session.
+        """The principal of an access token or a portal session.
 
         :raises BadCredentials: unknown, expired or revoked
         """
@@ -185,7 +173,7 @@ class Authenticator:
         return Principal.of(record)
 
     async def login_code(self, code: str, address: str) -> LoginResult:
-        """The principal of a one-time login link; the code is spent by this.
+        """The principal of a one-time login link; the code is used up.
 
         :raises BadCredentials: unknown, expired or used
         :raises TooManyTries: as for passwords
@@ -200,11 +188,11 @@ class Authenticator:
         return login
 
     async def open_session(self, login: LoginResult, address: str, how: str) -> str:
-        """A portal session for somebody just proved, and an audit entry; returns the token its cookie carries.
+        """Open a portal session, with an audit entry; returns the token for the cookie.
 
-        :param how: ``password`` or ``link``, for the record
+        :param how: ``password`` or ``link``, for the audit log
         :raises BadCredentials: the password was changed or the account disabled meanwhile
-        :raises Unavailable: it can't be put on record
+        :raises Unavailable: the audit entry cannot be written
         """
         token = passwords.new_token()
         try:
@@ -213,11 +201,11 @@ class Authenticator:
             )
         except Refused as error:
             raise BadCredentials(str(error)) from None
-        self._limiter.remember(login.full, address)
         return token
 
     def issue_ticket(self, principal: Principal, opens: TicketPurpose) -> str:
-        """A ticket, good once for :data:`TICKET_SECONDS`; where too many are open, another one is no more."""
+        """A ticket that works once within :data:`TICKET_SECONDS`. Where too many are open, it replaces
+        another one."""
         now = self._seconds()
         for key in [key for key, ticket in self._tickets.items() if ticket.until <= now]:
             del self._tickets[key]
@@ -231,20 +219,20 @@ class Authenticator:
         return ticket
 
     def _most_dispensable(self) -> str:
-        """The oldest ticket of the user who has most."""
+        """The oldest ticket of the user with most tickets."""
         [(greedy, _)] = Counter(each.principal.user_id for each in self._tickets.values()).most_common(1)
         return next(key for key, each in self._tickets.items() if each.principal.user_id == greedy)
 
-    async def ticket(self, ticket: str, asked: TicketPurpose, *, spend: bool = True) -> Principal:
+    async def ticket(self, ticket: str, purpose: TicketPurpose, *, spend: bool = True) -> Principal:
         """The principal of a ticket.
 
-        :param asked: what is to be opened with it
-        :param spend: the ticket is spent by this, whatever comes of it; else it is only looked at
-        :raises BadCredentials: unknown, used, too old, for something else, or its user's session has ended since
+        :param purpose: the purpose that the request needs
+        :param spend: use the ticket up, even if the request fails later; otherwise it is only checked
+        :raises BadCredentials: unknown, used, expired, for another purpose, or its user's session has ended
         """
         key = passwords.token_hash(ticket)
         found = self._tickets.pop(key, None) if spend else self._tickets.get(key)
-        if found is None or found.until <= self._seconds() or not found.opens.covers(asked):
+        if found is None or found.until <= self._seconds() or not found.opens.covers(purpose):
             raise BadCredentials(
                 "the ticket is unknown, used, expired or for something else; ask for a new one"
             )
@@ -255,17 +243,17 @@ class Authenticator:
 
 
 def named_realm(user: str) -> str:
-    """The realm that somebody names with a user's name, there or not; empty where it can't be."""
-    return normalise(parted(user)[1])
+    """The realm in a login name, whether it exists or not; empty if it is not valid."""
+    return normalise(split_name(user)[1])
 
 
 def session_token(origins: Origins, name: str, header: str, origin: str | None, host: str) -> str | None:
-    """The token of a session cookie in a websocket's handshake, ``None`` when there is no such cookie.
+    """The token of a session cookie in a websocket's handshake; ``None`` without such a cookie.
 
     :param name: of the cookie
     :param header: ``Cookie``
     :raises Refused: a cookie without a listed Origin
-    :raises BadCredentials: the relay's own page has none
+    :raises BadCredentials: the relay's own page sent none
     """
     token = _cookie(header, name)
     if token is None:
@@ -277,7 +265,8 @@ def session_token(origins: Origins, name: str, header: str, origin: str | None, 
 
 
 def _cookie(header: str, name: str) -> str | None:
-    """The value of a cookie, as Twisted finds it for requests: split, since ``http.cookies`` takes quadratic time."""
+    """The value of a cookie, by splitting as Twisted does for requests: ``http.cookies`` takes quadratic
+    time."""
     found = None
     for each in header.split(";"):
         key, equals, value = each.lstrip().partition("=")
@@ -287,7 +276,7 @@ def _cookie(header: str, name: str) -> str | None:
 
 
 def _consume(s: Session, code_hash: str, now: float) -> LoginResult | None:
-    """Use a login link up."""
+    """Mark a login link as used."""
     found = queries.consume_login(s, code_hash, now)
     user = None if found is None else queries.get_user(s, found.user_id)
     if user is None:
@@ -296,7 +285,9 @@ def _consume(s: Session, code_hash: str, now: float) -> LoginResult | None:
 
 
 def _open_session(s: Session, login: LoginResult, token_hash: str, origin: str, how: str, now: float) -> None:
-    """The session and its audit entry, both or neither."""
+    """The session, its audit entry and, for a login link, the network it was opened from, all or nothing."""
+    if how == "link":  # the check of a password has stored it already
+        queries.remember_login_network(s, login.user_id, network_of(origin), now)
     queries.open_session(
         s,
         login.user_id,

@@ -1,4 +1,4 @@
-"""Which pages' cookies count here (RFC 6454): the relay's own, and those that were listed."""
+"""Origins from which session cookies are accepted (RFC 6454): the relay's own, and listed ones."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _HOST = re.compile(r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?\Z")
 
 
 class Origins:
-    """The list of origins a cookie may come from.
+    """The origins that a cookie may come from.
 
-    The relay's own origin counts when it is an address or ``localhost``: a host name could be rebound by whoever
-    owns it, so a name must be listed.
+    The relay's own origin is accepted when it is an IP address or ``localhost``. The owner of a host name
+    could rebind it, so names must be listed.
 
-    :param scheme: ``http`` or ``https``, what the relay itself speaks
+    :param scheme: ``http`` or ``https``, as the relay itself speaks
     :param listed: ``https://host[:port]`` each
-    :raises Invalid: something listed is no origin
+    :raises Invalid: an entry is not an origin
     """
 
     def __init__(self, scheme: str, listed: Iterable[str] = ()) -> None:
@@ -31,25 +31,29 @@ class Origins:
         self._listed = {_checked(each) for each in listed}
 
     def base(self, host: str) -> str:
-        """``scheme://host[:port]`` of this relay for who asks it by this ``Host``.
+        """``scheme://host[:port]`` of this relay for a client that sent this ``Host``.
 
-        Behind a proxy that speaks another scheme, the origin that people see is a listed one.
+        Behind a proxy with another scheme it is the listed origin of that host.
 
-        :raises Invalid: it is no host
+        :raises Invalid: it is not a host
         """
         if len(host) > NAME or _HOST.match(host) is None:
-            raise Invalid("send 'Host' with the name or address the relay is asked by")
+            raise Invalid("send 'Host' with the name or address of the relay")
         seen = {each: _parse(f"{each}://{host}") for each in ("https", "http")}
         scheme = next((each for each, origin in seen.items() if origin in self._listed), self._scheme)
         return f"{scheme}://{host}"
 
-    def check(self, origin: str | None, host: str) -> None:
-        """Take or refuse a cookie that came with this ``Origin`` and ``Host``.
+    def encrypted(self, host: str) -> bool:
+        """Whether a browser that sent this ``Host`` uses TLS: the relay does, or the proxy of a listed origin."""
+        return self.tls or _parse(f"https://{host}") in self._listed
 
-        :raises Refused: no Origin at all, or one that is neither listed nor the relay's own
+    def check(self, origin: str | None, host: str) -> None:
+        """Check a cookie that came with this ``Origin`` and ``Host``.
+
+        :raises Refused: there is no Origin, or it is neither listed nor the relay's own
         """
         if origin is None:
-            raise Refused("a session cookie counts only with an Origin header; programs use an access token")
+            raise Refused("a session cookie needs an Origin header; programs use an access token instead")
         asked = _parse(origin)
         if asked is not None and asked in self._listed:
             return
@@ -69,12 +73,12 @@ class _Origin(NamedTuple):
 def _checked(listed: str) -> _Origin:
     origin = _parse(listed)
     if origin is None or urlsplit(listed).path.strip("/"):
-        raise Invalid(f"'{listed}' is no origin; write https://host or https://host:port")
+        raise Invalid(f"'{listed}' is not an origin; write https://host or https://host:port")
     return origin
 
 
 def _parse(text: str) -> _Origin | None:
-    """An origin, ``None`` for what is none, such as ``null``."""
+    """An origin; ``None`` for anything else, such as ``null``."""
     try:
         parts = urlsplit(text.strip().lower())
         port = parts.port

@@ -1,38 +1,52 @@
-"""One client's interest in one topic."""
+"""One client's subscription to one topic: its throttle, its queue, and notifications about it."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import NamedTuple, Protocol
 
-from relay_protocol import rosbridge
+from relay_protocol import link, rosbridge
 from relay_protocol.errors import Refused
 from relay_protocol.limits import MIB
-from relay_server.channels.encodings import PLAIN, TOO_COSTLY, MessageEncoding
-from relay_server.channels.samples import RenderError, Sample, output_format_for
+from relay_server.channels.encodings import PLAIN, MessageEncoding
+from relay_server.channels.samples import Rendered, RenderError, Sample, output_format_for
+from relay_server.channels.thinning import least_thinning
 from relay_server.common.clock import Clock, Timer
-from relay_server.common.cpu_quota import UserQuota
 
 THROTTLE_SECONDS = 3600.0
-"""Longest throttle; a client that asks for more gets this."""
+"""Longest throttle; a client that requests more gets this."""
 
-ASKS = 64
-"""Subscriptions of one client to one topic, merged into one listener."""
+MAX_REQUESTS = 64
+"""Most ``subscribe`` operations of one client for one topic, which are merged."""
 
 QUEUE_LENGTH = 1000
-"""Longest queue; a client that asks for more gets this."""
+"""Longest queue; a client that requests more gets this."""
 
 QUEUE_BYTES = 2 * MIB
-"""Most bytes that wait within the throttle of one listener; the newest sample may be larger."""
+"""Most bytes that wait within the throttle of one subscription; the newest sample may be larger."""
 
 QUEUES_BYTES = 8 * MIB
-"""Most bytes that wait within the throttles of one client; the newest sample of each topic may be beyond it."""
+"""Most bytes that wait in the throttles of one client; the newest sample of each topic is kept even beyond it."""
 
-PLAINLY_SECONDS = 60.0
-"""How often a client is told that it gets plain JSON because it has used up its share of the processor."""
+PLAIN_NOTICE_SECONDS = 60.0
+"""Least seconds between notices that a client gets plain JSON because its CPU quota is used up."""
 
-TOO_SLOW_SECONDS = 10.0
-"""How often a client is told that samples of a topic are dropped because its connection is thin."""
+SLOW_NOTICE_SECONDS = 10.0
+"""Least seconds between notices that samples of a topic are dropped because the client's connection is slow, and
+between those that the robot's link is."""
+
+SLOW_LINK = "slow_link"
+SLOW_ROBOT = "slow_robot"
+"""Reasons for samples that a robot has not sent: newer ones replaced them, or it was too busy (SPEC 2.5)."""
+
+LINK_TOO_SLOW = (
+    "samples are dropped, as the robot's link is too slow for all that is subscribed. Subscribe with a throttle_rate, "
+    "or to fewer or smaller topics"
+)
+ROBOT_TOO_SLOW = (
+    "samples are dropped, as the robot's computer is too busy to send them; subscribe to fewer topics"
+)
+_DROP_WARNINGS = {SLOW_LINK: LINK_TOO_SLOW, SLOW_ROBOT: ROBOT_TOO_SLOW}
 
 _LEVELS = {
     RenderError.BROKEN: "error",
@@ -42,239 +56,255 @@ _LEVELS = {
 }
 
 
-class SubscriberPort(Protocol):
-    """A session, as a topic's listeners use it."""
+class SampleReceiver(Protocol):
+    """Receives the samples of a subscription: a client's :class:`~relay_server.sessions.context.ClientContext`, whose
+    ``deliver`` is that of its port; a recording; or a part of the channel itself.
+    """
 
     plain_instead: int
-    """Messages sent as plain JSON because a costlier form was not affordable."""
+    """Messages sent as plain JSON because a costlier encoding exceeded the user's CPU quota."""
 
     queued_bytes: int
-    """Bytes that wait within the throttles of all its listeners; they keep it."""
+    """Bytes that wait in the throttles of all its subscriptions, which update the number."""
 
-    @property
-    def allowance(self) -> UserQuota:
-        """What its user may have of the processor."""
+    def deliver(self, subscription: ClientSubscription, sample: Sample) -> None:
+        """Send or queue a sample for the client."""
 
-    def deliver(self, listener: ClientSubscription, parcel: Sample) -> None:
-        """Queue a sample for the client."""
-
-    def dropped(self, listener: ClientSubscription) -> None:
+    def dropped(self, subscription: ClientSubscription) -> None:
         """Count a sample that the client will not get."""
 
-    def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
-        """Report something in words, to clients that want to hear it."""
+    def notify(self, level: str, text: str, id: rosbridge.Id = None) -> None:
+        """Send a status, if the client has requested that level."""
+
+    def warn_of_drops(self, text: str, id: rosbridge.Id = None) -> None:
+        """Warn of samples that the robot's link does not carry, unless the receiver shows the counts itself."""
 
 
 class SubscribeRequest(NamedTuple):
-    """One subscription, and the form it asks for."""
+    """One ``subscribe`` operation, and the encoding it requests."""
 
-    ask: rosbridge.Subscribe
-    form: MessageEncoding
+    operation: rosbridge.Subscribe
+    encoding: MessageEncoding
 
 
 class ClientSubscription:
-    """One client's interest in one topic: its subscriptions merged, as rosbridge does.
+    """One client's subscription to one topic. Several ``subscribe`` operations are merged, as rosbridge_suite does.
 
     :param topic: its full name
     """
 
     __slots__ = (
-        "_asks",
         "_clock",
-        "_failed",
-        "_plainly_at",
+        "_link_notice_at",
+        "_notified_errors",
+        "_notified_ids",
+        "_plain_notice_at",
         "_queued_bytes",
         "_receiver",
+        "_requests",
         "_sent_at",
+        "_slow_notice_at",
         "_timer",
-        "_told",
-        "_too_slow_at",
         "_waiting",
         "depth",
+        "format",
+        "thin",
         "throttle",
         "topic",
-        "wish",
     )
 
-    def __init__(self, clock: Clock, receiver: SubscriberPort, topic: str) -> None:
+    def __init__(self, clock: Clock, receiver: SampleReceiver, topic: str) -> None:
         self._clock = clock
         self._receiver = receiver
         self.topic = topic
         self.throttle = 0.0
-        """Least seconds between two samples: the least any of the subscriptions asks for."""
+        """Least seconds between two samples: the shortest that any operation requests."""
+        self.thin: link.Thinning | None = None
+        """Of point clouds: the least thinning that its operations request; ``None``: all points."""
         self.depth = 0
-        """Samples that may wait for this client: the most any subscription asks for; 0 leaves it to the relay."""
-        self.wish = output_format_for((topic,), PLAIN)
-        """The names the topic is subscribed by, latest compression and least size of fragments."""
-        self._asks: dict[tuple[str, rosbridge.Id], SubscribeRequest] = {}
-        self._told: set[RenderError] = set()
-        self._failed: frozenset[rosbridge.Id] = frozenset()
-        """Ids of the subscriptions whose failure the client was told."""
-        self._plainly_at = -PLAINLY_SECONDS
-        self._too_slow_at = -TOO_SLOW_SECONDS
+        """Most samples that wait for this client: the most that any operation requests; 0: the relay decides."""
+        self.format = output_format_for((topic,), PLAIN)
+        """Of the operations: all spellings of the topic, the latest compression and the least size of fragments."""
+        self._requests: dict[tuple[str, rosbridge.Id], SubscribeRequest] = {}
+        self._notified_errors: set[RenderError] = set()
+        self._notified_ids: frozenset[rosbridge.Id] = frozenset()
+        """Ids of the operations of whose failure the client was notified."""
+        self._plain_notice_at = -PLAIN_NOTICE_SECONDS
+        self._slow_notice_at = self._link_notice_at = -SLOW_NOTICE_SECONDS
         self._sent_at = -THROTTLE_SECONDS
-        # A deque takes 600 bytes when it is empty; most never have a throttle.
+        # An empty deque takes 600 bytes, and most subscriptions never have a throttle.
         self._waiting: deque[Sample] | None = None
         self._queued_bytes = 0
         self._timer: Timer | None = None
 
     @property
-    def allowance(self) -> UserQuota:
-        """What its user may have of the processor."""
-        return self._receiver.allowance
+    def robot_throttle(self) -> float:
+        """Least seconds between two samples that the robot must send; a client that queues samples needs all."""
+        return 0.0 if self._queues else self.throttle
 
     @property
-    def spared(self) -> float:
-        """Least seconds between two samples of the robot that this one needs: who wants them queued needs all."""
-        return 0.0 if self.depth else self.throttle
+    def _queues(self) -> bool:
+        """Whether more than the newest sample may wait within the throttle."""
+        return self.depth > 1
 
     @property
     def raw(self) -> bool:
-        """Whether samples are wanted as the robot sends them, so that their type need not be known."""
-        return self.wish.form.compression == "cbor-raw"
+        """Whether the client gets samples as the robot sends them, so that their type need not be known."""
+        return self.format.encoding.compression == "cbor-raw"
 
-    def add(self, ask: rosbridge.Subscribe, form: MessageEncoding = PLAIN) -> None:
-        """One more subscription, or another one under the same name and id.
+    def add(self, operation: rosbridge.Subscribe, encoding: MessageEncoding = PLAIN) -> None:
+        """Add an operation, or replace the one with the same name and id.
 
-        :raises Refused: too many on this topic
+        :raises Refused: there are too many on this topic
         """
-        key = (ask.topic, ask.id)
-        if key not in self._asks and len(self._asks) >= ASKS:
-            raise Refused(f"at most {ASKS} subscriptions to one topic can be held on one connection")
+        key = (operation.topic, operation.id)
+        if key not in self._requests and len(self._requests) >= MAX_REQUESTS:
+            raise Refused(f"at most {MAX_REQUESTS} subscriptions to one topic can be held on one connection")
         # The latest is the last, also when it replaces one.
-        self._asks.pop(key, None)
-        self._asks[key] = SubscribeRequest(ask, form)
-        self._told.clear()
-        self._failed -= {ask.id}
+        self._requests.pop(key, None)
+        self._requests[key] = SubscribeRequest(operation, encoding)
+        self._notified_errors.clear()
+        self._notified_ids -= {operation.id}
         self._merge()
 
     def remove(self, name: str, id: rosbridge.Id) -> bool:
-        """One subscription less; whether any are left.
+        """Remove an operation; returns whether any are left.
 
-        :param name: the topic as the client writes it. Another spelling than in ``subscribe`` will do.
+        :param name: the topic as the client writes it; another spelling than in ``subscribe`` is accepted
         """
-        if self._asks.pop((name, id), None) is None:
-            for key in [key for key in self._asks if key[1] == id]:
-                del self._asks[key]
-        if self._asks:
+        if self._requests.pop((name, id), None) is None:
+            for key in [key for key in self._requests if key[1] == id]:
+                del self._requests[key]
+        if self._requests:
             self._merge()
-        return bool(self._asks)
+        return bool(self._requests)
 
     def _merge(self) -> None:
-        asks = [each.ask for each in self._asks.values()]
-        forms = [each.form for each in self._asks.values()]
-        least = min(ask.throttle_rate for ask in asks) / 1000
+        operations = [each.operation for each in self._requests.values()]
+        encodings = [each.encoding for each in self._requests.values()]
+        least = min(operation.throttle_rate for operation in operations) / 1000
         self.throttle = min(max(0.0, least), THROTTLE_SECONDS)
-        self.depth = min(max(0, max(ask.queue_length for ask in asks)), QUEUE_LENGTH)
-        size = min((form.fragment_size for form in forms if form.fragment_size), default=0)
-        names = tuple(dict.fromkeys(ask.topic for ask in asks))
-        self.wish = output_format_for(names, MessageEncoding(forms[-1].compression, size))
+        self.thin = least_thinning(operation.thin for operation in operations)
+        self.depth = min(max(0, max(operation.queue_length for operation in operations)), QUEUE_LENGTH)
+        size = min((encoding.fragment_size for encoding in encodings if encoding.fragment_size), default=0)
+        names = tuple(dict.fromkeys(operation.topic for operation in operations))
+        self.format = output_format_for(names, MessageEncoding(encodings[-1].compression, size))
         if self._timer is not None:
-            self._make_room()
+            self._evict()
             self._timer.cancel()
-            self._wait()
+            self._start_timer()
 
-    def offer(self, sample: Sample) -> None:
-        """A new sample. Within the throttle it waits, in a queue or as the newest, so the last of a burst arrives.
+    def receive(self, sample: Sample) -> None:
+        """Deliver a new sample. Within the throttle it waits, in a queue or as the newest: the last of a burst arrives.
 
         Source: rosbridge v2 protocol, section 3.3.4, ``queue_length``.
         """
         throttle = self.throttle
         if throttle:
             now = self._clock.seconds()
-            if now < self._sent_at + throttle or (self.depth and self._waiting):
+            if now < self._sent_at + throttle or (self._queues and self._waiting):
                 self._queue(sample)
                 return
             self._sent_at = now
         if self._timer is not None:
-            # What waited under a longer throttle is older than this one.
-            if self.depth:
+            # Samples that wait under an earlier, longer throttle are older than this one.
+            if self._queues:
                 self._send_all()
             else:
                 self.close()
         self._receiver.deliver(self, sample)
 
     def replay(self, sample: Sample) -> None:
-        """A latched sample for a late joiner; each is of another publisher, so no throttle drops any."""
+        """Deliver a latched sample to a late joiner. Each is of another publisher, so no throttle drops any."""
         self._receiver.deliver(self, sample)
 
-    def missed(self, count: int) -> None:
-        """Samples of the topic did not come from the robot; for who keeps count of them."""
+    def samples_dropped(self, loss: link.SamplesDropped) -> None:
+        """The robot has dropped samples: warn the client, not too often, if it or its link is too slow."""
+        words, now = _DROP_WARNINGS.get(loss.reason), self._clock.seconds()
+        if words is not None and now >= self._link_notice_at + SLOW_NOTICE_SECONDS:
+            self._link_notice_at = now
+            self._receiver.warn_of_drops(f"{self.topic}: {words}", self.latest)
 
-    def complain(self, flaw: RenderError, words: str) -> None:
-        """Tell the client why it does not get what it asked for: once for each id, until it asks again."""
-        if flaw not in self._told:
-            self._told.add(flaw)
+    def report(self, rendered: Rendered) -> bytes | None:
+        """Notify the client of a problem with a rendered sample; returns the frames to send, if there are any."""
+        if rendered.error is RenderError.TOO_COSTLY:
+            self._plain_instead(rendered.words)
+        elif rendered.error is not None:
+            self.notify_error(rendered.error, rendered.words)
+        return rendered.frames
+
+    def notify_error(self, error: RenderError, words: str) -> None:
+        """Notify the client of an error of samples: once for each id, until it subscribes again."""
+        if error not in self._notified_errors:
+            self._notified_errors.add(error)
             for id in self.ids:
-                self._receiver.tell(_LEVELS[flaw], f"{self.topic}: {words}", id)
+                self._receiver.notify(_LEVELS[error], f"{self.topic}: {words}", id)
 
     def warn(self, words: str) -> None:
-        """Tell the client of something it should know, for each of its subscriptions."""
+        """Send a warning about the topic, for each id."""
         for id in self.ids:
-            self._receiver.tell("warning", f"subscribe {self.topic}: {words}", id)
+            self._receiver.notify("warning", f"subscribe {self.topic}: {words}", id)
 
     def fail(self, words: str) -> None:
-        """Tell the client that it gets nothing, and why: once for each id, until it asks again or that has passed."""
+        """Notify the client that the topic can't be subscribed: once for each id, until it subscribes again or
+        :meth:`clear_failures`.
+        """
         for id in self.ids:
-            if id not in self._failed:
-                self._failed |= {id}
-                self._receiver.tell("error", f"subscribe {self.topic}: {words}", id)
+            if id not in self._notified_ids:
+                self._notified_ids |= {id}
+                self._receiver.notify("error", f"subscribe {self.topic}: {words}", id)
 
-    def mended(self) -> None:
-        """What made it fail has passed; what comes next is news."""
-        self._failed = frozenset()
+    def clear_failures(self) -> None:
+        """The topic could be subscribed; the client is notified of the next failure."""
+        self._notified_ids = frozenset()
 
     @property
     def latest(self) -> rosbridge.Id:
-        """The id of the latest subscription."""
-        return next(reversed(self._asks))[1]
+        """The id of the latest operation."""
+        return next(reversed(self._requests))[1]
 
     @property
     def ids(self) -> list[rosbridge.Id]:
-        """Of its subscriptions."""
-        return list(dict.fromkeys(id for _, id in self._asks))
+        """The ids of its operations."""
+        return list(dict.fromkeys(id for _, id in self._requests))
 
-    def plainly(self) -> None:
-        """A sample comes as plain JSON for once: tell the client now and then."""
+    def _plain_instead(self, words: str) -> None:
         self._receiver.plain_instead += 1
         now = self._clock.seconds()
-        if now >= self._plainly_at + PLAINLY_SECONDS:
-            self._plainly_at = now
-            self._receiver.tell("warning", f"{self.topic}: {TOO_COSTLY}", self.latest)
+        if now >= self._plain_notice_at + PLAIN_NOTICE_SECONDS:
+            self._plain_notice_at = now
+            self._receiver.notify("warning", f"{self.topic}: {words}", self.latest)
 
     def too_slow(self, words: str) -> None:
-        """A sample is dropped because the client's connection is thin: tell the client now and then.
+        """Notify the client, not too often, that samples are dropped because its connection is slow.
 
-        :param words: what it can do
+        :param words: advice
         """
         now = self._clock.seconds()
-        if now >= self._too_slow_at + TOO_SLOW_SECONDS:
-            self._too_slow_at = now
-            self._receiver.tell("warning", f"{self.topic}: samples are dropped: {words}", self.latest)
+        if now >= self._slow_notice_at + SLOW_NOTICE_SECONDS:
+            self._slow_notice_at = now
+            self._receiver.notify("warning", f"{self.topic}: samples are dropped: {words}", self.latest)
 
     def close(self) -> None:
-        """Stop; nothing more is sent."""
+        """Stop the throttle and drop what waits in it."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         while self._waiting:
-            self._take()
+            self._dequeue()
 
     def _queue(self, sample: Sample) -> None:
         if self._waiting is None:
             self._waiting = deque()
-        elif self._waiting and not self.depth:
-            # It gives way to a newer one by the client's own wish: no drop.
-            self._take()
         self._waiting.append(sample)
         self._queued_bytes += sample.size
         self._receiver.queued_bytes += sample.size
-        self._make_room()
+        self._evict()
         if self._timer is None:
-            self._wait()
+            self._start_timer()
 
-    def _make_room(self) -> None:
-        """The oldest give way; the newest always stays."""
+    def _evict(self) -> None:
+        """Drop the oldest samples beyond the limits; the newest is always kept."""
         receiver = self._receiver
         while self._waiting and (
             len(self._waiting) > max(self.depth, 1)
@@ -283,35 +313,37 @@ class ClientSubscription:
                 and (self._queued_bytes > QUEUE_BYTES or receiver.queued_bytes > QUEUES_BYTES)
             )
         ):
-            self._take()
-            receiver.dropped(self)
+            self._dequeue()
+            if self._queues:
+                # Otherwise the newest replaces the one before, as requested.
+                receiver.dropped(self)
 
-    def _take(self) -> Sample:
+    def _dequeue(self) -> Sample:
         assert self._waiting
         sample = self._waiting.popleft()
         self._queued_bytes -= sample.size
         self._receiver.queued_bytes -= sample.size
         return sample
 
-    def _wait(self) -> None:
+    def _start_timer(self) -> None:
         left = self._sent_at + self.throttle - self._clock.seconds()
-        self._timer = self._clock.callLater(max(0.0, left), self._due)
+        self._timer = self._clock.callLater(max(0.0, left), self._send_next)
 
-    def _due(self) -> None:
+    def _send_next(self) -> None:
         self._timer = None
         if not self.throttle:
             self._send_all()
         elif self._waiting:
             self._sent_at = self._clock.seconds()
-            self._receiver.deliver(self, self._take())
-            # The client may be gone by what was sent.
+            self._receiver.deliver(self, self._dequeue())
+            # Delivering may have closed the connection.
             if self._waiting and self._timer is None:
-                self._wait()
+                self._start_timer()
 
     def _send_all(self) -> None:
-        """The throttle was lifted."""
+        """Deliver all that waits, as there is no throttle any more."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         while self._waiting:
-            self._receiver.deliver(self, self._take())
+            self._receiver.deliver(self, self._dequeue())

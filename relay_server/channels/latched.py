@@ -1,9 +1,9 @@
 """The latched (transient-local) samples of one topic, for clients that subscribe later.
 
-Only the middleware knows what its publishers still keep: the depth of each is not in the graph (Fast DDS does not
-announce it), and rclpy does not tell which publisher a sample is of. So the relay keeps bodies, and for each new
-subscriber the robot says which of them are still kept (SPEC 2.5, ``kept`` of ``subscribe``). Of a robot that can't say
-that, the relay replays as many of the last samples as the topic has publishers.
+Only the middleware knows which samples its publishers still keep: Fast DDS does not announce the depth of a publisher,
+and rclpy does not report which publisher sent a sample. So the relay stores bodies, and for each new subscriber the
+robot reports which of them are still kept (SPEC 2.5, ``known_stamps`` of ``subscribe``). For a robot that can't report
+this, the relay replays as many of the last samples as the topic has publishers.
 """
 
 from __future__ import annotations
@@ -12,118 +12,122 @@ from collections.abc import Callable
 
 from relay_protocol import limits
 from relay_server.channels.client_subscription import ClientSubscription
-from relay_server.channels.robot_link import Subscriber
+from relay_server.channels.members import ChannelMember
 from relay_server.channels.samples import Sample
 from relay_server.common.clock import Clock, Timer, cancel
 
-MOST = 1000
-"""Latched samples kept of one topic."""
+MAX_SAMPLES = 1000
+"""Most latched samples stored of one topic."""
 
-MOST_UNTOLD = 64
-"""Latched samples kept of one topic of a robot that can't say which are still kept: one for each publisher."""
+MAX_UNREPORTED = 64
+"""Most latched samples, one for each publisher, of a robot that can't report which are still kept."""
 
-KEPT_BYTES = limits.ROBOT_FRAME
-"""Most bytes of latched samples kept for one topic, and most that wait for its type."""
+LATCHED_BYTES = limits.ROBOT_FRAME
+"""Most bytes of latched samples stored for one topic, and most that wait for its type."""
 
-HOLD_SECONDS = 0.5
-"""A new subscriber gets no live samples for so long, unless the robot repeats them: older ones are to come first."""
+REPLAY_SECONDS = 0.5
+"""Longest time in which a new subscriber receives no live samples, as the robot has to repeat older ones first."""
 
-ASK_SECONDS = 0.1
-"""Least time from one request for what is kept to the next of the same topic."""
+REQUEST_SECONDS = 0.1
+"""Least seconds between two requests to the robot for one topic."""
 
 
 class _Joiner:
-    """A subscription that is to get what publishers keep.
+    """A subscription that waits for the samples that publishers keep.
 
-    :param since: the newest stamp it has had, or could have had
-    :param live: whether it gets samples as they come; else those after ``since`` are given by :class:`Latched`
+    :param since: the newest stamp when it subscribed
+    :param live: whether it receives new samples directly; else :class:`LatchedSamples` replays those after ``since``
     """
 
-    __slots__ = ("given", "listener", "live", "since", "timer")
+    __slots__ = ("live", "received", "since", "subscription", "timer")
 
-    def __init__(self, listener: ClientSubscription, since: int, live: bool) -> None:
-        self.listener = listener
+    def __init__(self, subscription: ClientSubscription, since: int, live: bool) -> None:
+        self.subscription = subscription
         self.since = since
         self.live = live
-        self.given: set[int] = set()
+        self.received: set[int] = set()
         self.timer: Timer | None = None
 
-    def give(self, stamp: int, sample: Sample) -> None:
-        """Replay a sample, once."""
-        if stamp not in self.given and not (self.live and stamp > self.since):
-            self.given.add(stamp)
-            self.listener.replay(sample)
+    def replay(self, stamp: int, sample: Sample) -> None:
+        """Replay a sample, unless the subscription has received it."""
+        if stamp not in self.received and not (self.live and stamp > self.since):
+            self.received.add(stamp)
+            self.subscription.replay(sample)
 
 
-class Latched:
-    """See the module's text.
+class LatchedSamples:
+    """Stores latched samples and replays them; see the module's docstring.
 
-    :param ask: asks the robot which samples publishers keep; :meth:`asked` follows when that goes out
-    :param changed: called when another set of members is to get live samples
+    :param send_request: requests from the robot which samples publishers keep, and calls :meth:`request_sent`
+    :param changed: called when the set of members that receive live samples has changed
     """
 
-    def __init__(self, clock: Clock, ask: Callable[[], None], changed: Callable[[], None]) -> None:
+    def __init__(self, clock: Clock, send_request: Callable[[], None], changed: Callable[[], None]) -> None:
         self._clock = clock
-        self._ask = ask
+        self._send_request = send_request
         self._changed = changed
         self.memory = ""
-        """Names the robot's memory of stamps: under the same name, a stamp means the same sample. Empty: there is none.
-        """
-        self.wanted = False
-        """Whether the robot is to be asked."""
+        """Name of the robot's memory of stamps: under the same name, a stamp means the same sample. Empty: the robot
+        has no memory."""
+        self.request_due = False
+        """Whether a request is due."""
         self.newest = 0
-        self._most = 1
+        self._limit = 1
         self._samples: dict[int, Sample] = {}
         self._bytes = 0
-        self._joiners: dict[Subscriber, _Joiner] = {}
-        self._told: set[int] = set()
-        """Stamps that the robot has said are kept, since nobody waited for that."""
-        self._open = 0
-        """Requests that the robot has not done with."""
-        self._since = 0
-        """The newest stamp when the robot was last asked."""
-        self._asked_at = -ASK_SECONDS
+        self._joiners: dict[ChannelMember, _Joiner] = {}
+        self._confirmed: set[int] = set()
+        """Stamps that the robot has reported as kept, since the last time no request was open."""
+        self._open_requests = 0
+        """Requests that the robot has not completed."""
+        self._newest_at_request = 0
+        """The newest stamp when the last request was sent."""
+        self._requested_at = -REQUEST_SECONDS
         self._timer: Timer | None = None
 
     @property
     def stamps(self) -> list[int]:
-        """Stamps of the samples whose bodies the relay has."""
+        """Stamps of the stored samples, ascending."""
         return sorted(self._samples)
 
     @property
     def size(self) -> int:
-        """Bytes kept."""
+        """Bytes of the stored samples."""
         return self._bytes
 
-    def holds(self, member: Subscriber) -> bool:
-        """Whether a member gets no live samples yet."""
+    def waits_for_replay(self, member: ChannelMember) -> bool:
+        """Whether a member does not receive live samples yet."""
         joiner = self._joiners.get(member)
         return joiner is not None and not joiner.live
 
-    def robot(self, memory: str, publishers: int) -> None:
-        """The robot has subscribed, or its publishers have changed."""
+    def robot_subscribed(self, memory: str, publishers: int) -> None:
+        """Handle that the robot has subscribed, or that its publishers have changed.
+
+        :param memory: see :attr:`memory`
+        :param publishers: how many the topic has
+        """
         if memory != self.memory:
             self.forget()
             self.memory = memory
-        self._most = MOST if memory else min(max(publishers, 1), MOST_UNTOLD)
+        self._limit = MAX_SAMPLES if memory else min(max(publishers, 1), MAX_UNREPORTED)
         self._trim()
 
     def begin(self, stamp: int) -> None:
-        """The topic is latched from now on; samples up to this stamp came before that was known."""
+        """Note that the topic is latched; samples up to this stamp came before that was known."""
         self.newest = max(self.newest, stamp)
 
     def forget(self) -> None:
-        """The samples are not those of the topic any more."""
+        """Drop all samples, as they are no longer those of the topic."""
         self.lost()
         self._samples.clear()
         self._bytes = self.newest = 0
 
     def lost(self) -> None:
-        """The link is gone. A robot with the same memory goes on with its stamps: nobody gets a sample twice."""
+        """Handle the loss of the link. Samples stay: a robot with the same memory continues with its stamps."""
         cancel(self._timer)
         self._timer = None
-        self._open, self.wanted = 0, False
-        self._told.clear()
+        self._open_requests, self.request_due = 0, False
+        self._confirmed.clear()
         for joiner in self._joiners.values():
             cancel(joiner.timer)
         self._joiners.clear()
@@ -134,118 +138,118 @@ class Latched:
     # --- subscribers --------------------------------------------------------------------------------------
 
     def join(
-        self, member: Subscriber, listener: ClientSubscription, live: bool, since: int | None = None
+        self, member: ChannelMember, subscription: ClientSubscription, live: bool, since: int | None = None
     ) -> None:
-        """Give a member what publishers keep.
+        """Replay to a member the samples that publishers keep.
 
-        :param live: whether it has the topic already, by another subscription
-        :param since: the latest stamp when it subscribed; ``None`` for now
+        :param live: whether it receives the topic already, by another subscription
+        :param since: the latest stamp when it subscribed; ``None``: that of now
         """
         if not self.memory:
             for sample in list(self._samples.values()):
-                listener.replay(sample)
+                subscription.replay(sample)
             return
         self.leave(member)
-        joiner = self._joiners[member] = _Joiner(listener, self.newest if since is None else since, live)
+        joiner = self._joiners[member] = _Joiner(subscription, self.newest if since is None else since, live)
         if not live:
-            joiner.timer = self._clock.callLater(HOLD_SECONDS, self._release, joiner)
-        self.wanted = True
+            joiner.timer = self._clock.callLater(REPLAY_SECONDS, self._release, joiner)
+        self.request_due = True
         if self._timer is None:
-            pause = self._asked_at + ASK_SECONDS - self._clock.seconds()
+            pause = self._requested_at + REQUEST_SECONDS - self._clock.seconds()
             if pause > 0:
-                self._timer = self._clock.callLater(pause, self._ask_now)
+                self._timer = self._clock.callLater(pause, self._send_due_request)
             else:
-                self._ask()
+                self._send_request()
         self._changed()
 
-    def leave(self, member: Subscriber) -> None:
-        """A member has gone."""
+    def leave(self, member: ChannelMember) -> None:
+        """Remove a member."""
         joiner = self._joiners.pop(member, None)
         if joiner is not None:
             cancel(joiner.timer)
 
-    def asked(self) -> None:
-        """The robot has been sent the request."""
-        self.wanted = False
-        self._open += 1
-        self._since = self.newest
-        self._asked_at = self._clock.seconds()
+    def request_sent(self) -> None:
+        """Note that the request was sent."""
+        self.request_due = False
+        self._open_requests += 1
+        self._newest_at_request = self.newest
+        self._requested_at = self._clock.seconds()
 
-    def _ask_now(self) -> None:
+    def _send_due_request(self) -> None:
         self._timer = None
-        if self.wanted:
-            self._ask()
+        if self.request_due:
+            self._send_request()
 
     def _release(self, joiner: _Joiner) -> None:
-        """Live from now on. What came live and was not repeated is given; what is older than that was replaced."""
+        """Make a joiner live. It receives newer samples that the robot did not repeat; older ones were replaced."""
         cancel(joiner.timer)
         joiner.timer = None
         if joiner.live:
             return
-        after = max(joiner.given, default=joiner.since)
+        after = max(joiner.received, default=joiner.since)
         for stamp in self.stamps:
             if stamp > max(after, joiner.since):
-                joiner.give(stamp, self._samples[stamp])
+                joiner.replay(stamp, self._samples[stamp])
         joiner.live, joiner.since = True, self.newest
         self._changed()
 
     # --- samples ------------------------------------------------------------------------------------------
 
-    def take(self, stamp: int, sample: Sample) -> bool:
-        """Take a sample from the robot; whether it is new to all who get live samples.
+    def add(self, frame_stamp: int, sample: Sample) -> bool:
+        """Take a sample from the robot; return whether it is new to all members that receive live samples.
 
-        :param stamp: of the frame. One that is not newer than all before it repeats a sample, without its body where
-            the relay has that; 0 ends what was asked for.
+        :param frame_stamp: one that is not newer than all before it repeats a sample; the body is empty if the relay
+            has it. 0 with an empty body ends a request.
         """
         if not self.memory:
             self.newest += 1
-            self._keep(self.newest, sample)
+            self._store(self.newest, sample)
             return True
-        if stamp > self.newest:
-            self.newest = stamp
-            self._keep(stamp, sample)
+        if frame_stamp > self.newest:
+            self.newest = frame_stamp
+            self._store(frame_stamp, sample)
             return True
-        if stamp == 0 and not sample.size:
-            self._ended()
+        if frame_stamp == 0 and not sample.size:
+            self._request_ended()
             return False
-        known = self._samples.get(stamp)
+        known = self._samples.get(frame_stamp)
         if known is None:
             if not sample.size:
                 return False
             known = sample
-            self._keep(stamp, sample)
-        if stamp in self._samples:
-            self._told.add(stamp)
+            self._store(frame_stamp, sample)
+        if frame_stamp in self._samples:
+            self._confirmed.add(frame_stamp)
         for joiner in list(self._joiners.values()):
-            joiner.give(stamp, known)
+            joiner.replay(frame_stamp, known)
         return False
 
-    def _ended(self) -> None:
-        """The robot has done with a request: what no publisher keeps any more is forgotten."""
-        self._open = max(0, self._open - 1)
-        if self._open or self.wanted:
+    def _request_ended(self) -> None:
+        """End a request, and drop the samples that no publisher keeps any more."""
+        self._open_requests = max(0, self._open_requests - 1)
+        if self._open_requests or self.request_due:
             return
         for stamp in self.stamps:
-            if stamp <= self._since and stamp not in self._told:
+            if stamp <= self._newest_at_request and stamp not in self._confirmed:
                 self._drop(stamp)
-        self._told.clear()
+        self._confirmed.clear()
         for joiner in list(self._joiners.values()):
             self._release(joiner)
         self._joiners.clear()
 
-    def _keep(self, stamp: int, sample: Sample) -> None:
+    def _store(self, stamp: int, sample: Sample) -> None:
         self._samples[stamp] = sample
         self._bytes += sample.size
         self._trim()
 
     def _trim(self) -> None:
-        """The newest count, as far as they are not too large together."""
-        # One is kept however large it is.
-        while len(self._samples) > self._most or (self._bytes > KEPT_BYTES and len(self._samples) > 1):
+        """Drop the oldest samples beyond the limits of count and bytes."""
+        # A single sample is stored whatever its size.
+        while len(self._samples) > self._limit or (self._bytes > LATCHED_BYTES and len(self._samples) > 1):
             self._drop(min(self._samples))
 
     def _drop(self, stamp: int) -> None:
         self._bytes -= self._samples.pop(stamp).size
-        self._told.discard(stamp)
+        self._confirmed.discard(stamp)
         for joiner in self._joiners.values():
-            joiner.given.discard(stamp)
+            joiner.received.discard(stamp)

@@ -1,7 +1,7 @@
-"""What time it is where a robot lives: the relay's wall clock, or the simulated time that the robot's ``/clock`` tells.
+"""The time of a robot: the relay's wall clock, or the simulated time that is published on the robot's ``/clock``.
 
-Source: ROS 2 design, "Clock and Time": with ``use_sim_time`` time is what ``/clock`` said last, and 0 before it said
-anything.
+Source: ROS 2 design, "Clock and Time": with ``use_sim_time`` the time is that of the latest message of ``/clock``,
+and 0 before the first.
 """
 
 from __future__ import annotations
@@ -17,92 +17,111 @@ from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import SwitchboardError
 from relay_server.channels.client_subscription import ClientSubscription
 from relay_server.channels.encodings import MessageEncoding
-from relay_server.channels.robot_link import RobotLinkState
+from relay_server.channels.link_state import RobotLinkState
 from relay_server.channels.samples import Sample
 from relay_server.channels.subscriptions import Subscriptions
 from relay_server.common.clock import Clock
-from relay_server.common.cpu_quota import UserQuotas
 
 TOPIC = "/clock"
 TYPE = "rosgraph_msgs/msg/Clock"
 
 THROTTLE_MS = 20
-"""Simulators tell the time up to a thousand times a second; stamps that are exact to this are exact enough."""
+"""Least milliseconds between two messages. Simulators publish up to a thousand a second; stamps can be coarser."""
 
-_NOBODY = -1
+_NO_USER = -1
 _CDR = {b"\x00\x01": "<iI", b"\x00\x00": ">iI"}
 
 
 class RobotClock:
-    """Follows a robot's ``/clock`` while its time is simulated, as one more member of its channel.
+    """Subscribes to a robot's ``/clock`` while its time is simulated, as one more subscriber of its channel.
 
     :param wall_ns: Unix time in nanoseconds
     """
 
     log = Logger()
-    user = _NOBODY
+    user = _NO_USER
     plain_instead = 0
     queued_bytes = 0
-    allowance = UserQuotas(lambda: 0.0, lambda: 0.0).of(_NOBODY)
-    """Nothing is taken from it: ticks are read as the robot sends them."""
 
     def __init__(
-        self, clock: Clock, wire: RobotLinkState, subscriptions: Subscriptions, wall_ns: Callable[[], int]
+        self,
+        clock: Clock,
+        link_state: RobotLinkState,
+        subscriptions: Subscriptions,
+        wall_ns: Callable[[], int],
     ) -> None:
         self._clock = clock
-        self._wire = wire
+        self._link_state = link_state
         self._subscriptions = subscriptions
         self._wall_ns = wall_ns
         self._newest = 0
+        self._latest_known = 0
+        """As the newest time, but kept while the time is unknown: the simulation may have begun again meanwhile."""
         self._following = False
+        self.jumps = 0
+        """How often the simulated time has jumped back."""
+        self.on_jump: list[Callable[[], None]] = []
+        """Called when the simulated time has jumped back, before any sample with the new time is delivered."""
 
     def now_ns(self) -> int:
         """The robot's time, nanoseconds: since 1970, or since the simulation began."""
-        return self._newest if self._wire.robot.description.sim_time else self._wall_ns()
+        return self._newest if self._link_state.robot.description.sim_time else self._wall_ns()
 
     def follow(self) -> None:
-        """The channel has opened, or the robot has described itself: subscribe to ``/clock``, or no longer."""
-        wanted = self._wire.robot.description.sim_time
+        """Subscribe to ``/clock`` or unsubscribe, as the channel has opened or the robot's description has changed."""
+        wanted = self._link_state.robot.description.sim_time
         if self._following and not wanted:
             self._following = False
             self._subscriptions.remove(self, TOPIC)
             self.lost()
         elif wanted and not self._following:
-            ticks = _Ticks(self._clock, self, TOPIC)
-            # As the robot sends it: the type need not be known.
-            ticks.add(
+            subscription = _ClockSubscription(self._clock, self, TOPIC)
+            # cbor-raw is what the robot sends, so the type's definition is not needed.
+            subscription.add(
                 rosbridge.Subscribe(topic=TOPIC, throttle_rate=THROTTLE_MS), MessageEncoding("cbor-raw")
             )
             try:
-                self._subscriptions.add(self, ticks, TYPE, None)
+                self._subscriptions.add(self, subscription, TYPE, None)
                 self._following = True
             except SwitchboardError as error:
-                self.tell("error", str(error))
+                self.notify("error", str(error))
 
     def lost(self) -> None:
-        """The link is gone; nobody knows what time it will be when it is back."""
+        """The link is lost; the time is unknown until the next message."""
         self._newest = 0
 
-    def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
-        """What a client would be told goes to the log."""
+    def warn_of_drops(self, text: str, id: rosbridge.Id = None) -> None:
+        """Log it."""
+        self.notify("warning", text)
+
+    def notify(self, level: str, text: str, id: rosbridge.Id = None) -> None:
+        """Log a status."""
         self.log.warn(
-            "the simulated time of {robot}: {text}", robot=self._wire.robot.full, text=text, severity=level
+            "the simulated time of {robot}: {text}",
+            robot=self._link_state.robot.full,
+            text=text,
+            severity=level,
         )
 
-    def dropped(self, listener: ClientSubscription) -> None:
-        """None is queued."""
+    def dropped(self, subscription: ClientSubscription) -> None:
+        """Nothing: no sample is queued here."""
 
-    def deliver(self, listener: ClientSubscription, parcel: Sample) -> None:
-        """Keep the newest."""
-        told = nanoseconds(parcel.body)
-        if told is not None:
-            self._newest = told
+    def deliver(self, subscription: ClientSubscription, sample: Sample) -> None:
+        """Store the time of a sample."""
+        time = nanoseconds(sample.body)
+        if time is not None:
+            jumped = time < self._latest_known
+            self._newest = self._latest_known = time
+            if jumped:
+                self.jumps += 1
+                for notify in list(self.on_jump):
+                    notify()
 
 
-class _Ticks(ClientSubscription):
-    """The robot throttles already: every sample that comes is taken at once."""
+class _ClockSubscription(ClientSubscription):
+    """A subscription without a throttle of its own, as the robot throttles already."""
 
-    def offer(self, sample: Sample) -> None:
+    def receive(self, sample: Sample) -> None:
         self.replay(sample)
 
 
@@ -119,12 +138,15 @@ _clock_decoder: msgspec.json.Decoder[_Clock] = msgspec.json.Decoder(_Clock)
 
 
 def nanoseconds(body: bytes) -> int | None:
-    """What a ``rosgraph_msgs/msg/Clock`` says, in CDR with its header or as JSON; ``None`` when it is none."""
+    """The time in a ``rosgraph_msgs/msg/Clock``; ``None`` if the body is no such message.
+
+    :param body: CDR with its header, or JSON
+    """
     order = _CDR.get(body[:2])
     try:
         if order is None:
-            told = jsontext.decode(_clock_decoder, body).clock
-            return told.sec * 10**9 + told.nanosec
+            time = jsontext.decode(_clock_decoder, body).clock
+            return time.sec * 10**9 + time.nanosec
         sec, nanosec = struct.unpack_from(order, body, 4)
     except (SwitchboardError, struct.error):
         return None

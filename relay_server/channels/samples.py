@@ -1,11 +1,11 @@
-"""One message from a robot, on its way to many clients: converted once for each form anybody wants."""
+"""One message of a robot for many clients: rendered once for each format that clients request."""
 
 from __future__ import annotations
 
 import enum
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cbor2
 
@@ -15,269 +15,277 @@ from relay_protocol.limits import KIB
 from relay_protocol.ros.compiled import Reader
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.channels import encodings
-from relay_server.channels.encodings import PLAIN, MessageEncoding, divided
+from relay_server.channels.encodings import PLAIN, TOO_COSTLY, MessageEncoding, text_frames
 from relay_server.common import websocket_frames
+from relay_server.common.cpu_quota import UserQuota
 
-if TYPE_CHECKING:
-    from relay_server.channels.client_subscription import ClientSubscription
+_SPARE_BYTES = 64 * KIB
+"""Bytes that one sample may cache beyond four times its size; what is evicted is rendered again."""
 
-_SPARE = 64 * KIB
-"""What is made ready of one sample may take four times its size, and so much more; it can be made again."""
-
-_HEAD = 32
+_HEAD_BYTES = 32
 """Bytes of a ``publish`` around its ``msg``, at least."""
 
 
 class OutputFormat(NamedTuple):
-    """What a client wants to get of each sample.
+    """The format in which a client gets each sample.
 
-    :param names: the topic as the client writes it; one message goes under each
-    :param head: what comes before the body, where the wish is for one message in plain JSON; else empty
+    :param names: spellings of the topic by the client, which gets one message for each
+    :param head: text before the body if there is one message in plain JSON; else empty
     """
 
     names: tuple[str, ...]
-    form: MessageEncoding
+    encoding: MessageEncoding
     head: bytes
 
 
 @lru_cache(maxsize=1024)
-def output_format_for(names: tuple[str, ...], form: MessageEncoding) -> OutputFormat:
-    """What a client wants. Nearly all who want the same share one object, so that it is known at a glance."""
-    plain = form == PLAIN and len(names) == 1
-    return OutputFormat(names, form, rosbridge.publish_head(names[0]) if plain else b"")
+def output_format_for(names: tuple[str, ...], encoding: MessageEncoding) -> OutputFormat:
+    """The format for these names. Nearly all equal formats are one object, so they can be compared by identity."""
+    plain = encoding == PLAIN and len(names) == 1
+    return OutputFormat(names, encoding, rosbridge.publish_head(names[0]) if plain else b"")
 
 
 class RenderError(enum.Enum):
-    """Why a client does not get a sample as it wants it."""
+    """Why a client does not get a sample in the format that it requested."""
 
     BROKEN = "broken"
     NOT_CDR = "not cdr"
     TOO_LARGE = "too large"
+    TOO_COSTLY = "too costly"
     NOT_SENT = "not sent"
 
 
 class Rendered(NamedTuple):
-    """What is made of a sample for one wish.
+    """A sample in one format.
 
-    :param frames: websocket frames; ``None`` when it can't be converted
-    :param flaw: what the client is to be told, once, and ``words`` for it
+    :param frames: websocket frames; ``None``: the sample can't be converted
+    :param error: of which the client must be notified
+    :param words: text of the error
     """
 
     frames: bytes | None
-    flaw: RenderError | None = None
+    error: RenderError | None = None
     words: str = ""
 
 
 class Converter:
-    """What turns the samples of one topic into JSON and CBOR.
-
-    It stays right until the type's definition is replaced.
+    """Converts the samples of one topic to JSON and CBOR; it is valid until the type's definition is replaced.
 
     :param encoding: of the samples, ``cdr`` or ``json``
-    :param failed: called with the words for each sample that can't be converted
+    :param on_failure: called with the reason for each sample that can't be converted
     """
 
     def __init__(
-        self, types: TypeRegistry, type_name: str, encoding: str, failed: Callable[[str], None]
+        self, types: TypeRegistry, type_name: str, encoding: str, on_failure: Callable[[str], None]
     ) -> None:
         self.types = types
         self.type = type_name
         self.cdr = encoding == "cdr"
-        self.failed = failed
-        self.known = False
-        """What was known when it was last asked for; what is known stays known."""
+        self.on_failure = on_failure
+        self.ready = False
+        """The latest result of :meth:`check_ready`; once true, it stays true."""
         self._readers: dict[str, Reader] = {}
 
-    @property
-    def knows(self) -> bool:
-        """Whether all that this takes is known."""
-        if not self.known:
-            self.known = not self.cdr or self.types.knows(self.type)
-        return self.known
+    def check_ready(self) -> bool:
+        """Whether the type's definition is known, so that samples can be converted."""
+        if not self.ready:
+            self.ready = not self.cdr or self.types.knows(self.type)
+        return self.ready
 
     def convert(self, language: str, body: bytes) -> bytes:
-        """A sample's body in ``json`` or ``cbor``.
+        """The body of a sample, converted.
 
+        :param language: ``json`` or ``cbor``
         :raises SwitchboardError: it is no message of this type, or the type is not known
         """
         reader = self._readers.get(language)
         if reader is None:
-            found = self.types.reader(self.type, language) if self.cdr else _ANEW[language]
+            found = self.types.reader(self.type, language) if self.cdr else _REENCODERS[language]
             reader = self._readers[language] = found
         return reader(body)
 
 
 class Sample:
-    """One message from the robot. It is converted only if somebody takes it, and then once for all who want it so.
+    """One message of the robot. It is converted when it is sent to the first client, once for each format.
 
-    :param body: as the robot sent it
-    :param stamp: the robot's time when it came, nanoseconds: since 1970, or since the simulation began
+    :param body: in the robot's encoding
+    :param ros_time_ns: the robot's time when it received the message, nanoseconds since 1970 or since the
+        simulation began
     """
 
     __slots__ = (
+        "_cached",
+        "_cached_bytes",
         "_json",
-        "_others",
-        "_pictures",
-        "_plain",
-        "_plain_wish",
-        "_ready",
-        "_ready_bytes",
+        "_other_bodies",
+        "_pngs",
         "body",
         "converter",
+        "plain",
+        "plain_format",
+        "ros_time_ns",
         "size",
-        "stamp",
     )
 
-    def __init__(self, body: bytes, stamp: int, converter: Converter) -> None:
+    def __init__(self, body: bytes, ros_time_ns: int, converter: Converter) -> None:
         self.body = body
-        self.stamp = stamp
+        self.ros_time_ns = ros_time_ns
         self.converter = converter
         self.size = len(body)
-        # The first plain form, which is most often the only one, needs no table. The others are made when it is not.
+        # Most samples are rendered in one plain format only; the tables for others are made when needed.
         self._json: bytes | SwitchboardError | None = None
-        self._plain_wish: OutputFormat | None = None
-        self._plain = b""
-        self._others: dict[str, bytes | SwitchboardError] | None = None
-        self._pictures: dict[str, bytes] | None = None
-        self._ready: dict[OutputFormat, Rendered] | None = None
-        self._ready_bytes = 0
+        self.plain_format: OutputFormat | None = None
+        self.plain = b""
+        self._other_bodies: dict[str, bytes | SwitchboardError] | None = None
+        self._pngs: dict[str, bytes] | None = None
+        self._cached: dict[OutputFormat, Rendered] | None = None
+        self._cached_bytes = 0
 
-    def open(self, listener: ClientSubscription) -> bytes | None:
-        """The websocket frames for a client that listens so; ``None`` when it can't be converted."""
-        wish = listener.wish
-        if wish is self._plain_wish:
-            return self._plain
-        if wish.head and self._plain_wish is None:
-            frames = self._first_plain(wish)
+    def render(self, format: OutputFormat, quota: UserQuota) -> bytes | Rendered:
+        """The websocket frames in a format.
+
+        A costly encoding counts towards the quota; if that is used up, the frames are plain JSON instead. Other clients
+        get a format that was rendered already without cost.
+
+        :returns: the frames; or a :class:`Rendered` if the client must be notified of something
+        """
+        if format is self.plain_format:
+            return self.plain
+        if format.head and self.plain_format is None:
+            frames = self._render_first_plain(format)
             if frames is not None:
                 return frames
-        ready = self._found(wish) or self._ready_for(listener)
-        if ready.flaw is not None:
-            listener.complain(ready.flaw, ready.words)
-        return ready.frames
+        rendered = self._cached_render(format) or self._render_within(format, quota)
+        if rendered.error is None and rendered.frames is not None:
+            return rendered.frames
+        return rendered
 
-    def _first_plain(self, wish: OutputFormat) -> bytes | None:
-        """What :meth:`_make` would make for the first who wants one message in plain JSON, unless it is broken."""
-        body = self._in("json")
+    def json(self) -> bytes | SwitchboardError:
+        """The message as JSON, or the error why it can't be converted."""
+        return self._body_in("json")
+
+    def _render_first_plain(self, format: OutputFormat) -> bytes | None:
+        """Frames in the first plain format, as :meth:`_render` makes them; ``None``: the sample can't be converted."""
+        body = self._json
+        if body is None:
+            body = self._json = self._convert("json")
         if isinstance(body, SwitchboardError):
             return None
-        self._plain_wish = wish
-        self._plain = websocket_frames.text_of(wish.head, body, b"}")
-        self._ready_bytes += len(self._plain)
-        return self._plain
+        self.plain_format = format
+        self.plain = websocket_frames.text_of(format.head, body, b"}")
+        self._cached_bytes += len(self.plain)
+        return self.plain
 
-    def _found(self, wish: OutputFormat) -> Rendered | None:
-        if wish == self._plain_wish:
-            return Rendered(self._plain)
-        return None if self._ready is None else self._ready.get(wish)
+    def _cached_render(self, format: OutputFormat) -> Rendered | None:
+        if format == self.plain_format:
+            return Rendered(self.plain)
+        return None if self._cached is None else self._cached.get(format)
 
-    def _ready_for(self, listener: ClientSubscription) -> Rendered:
-        """Make it ready: at the cost of the client's user where that is much, else as plain JSON.
+    def _render_within(self, format: OutputFormat, quota: UserQuota) -> Rendered:
+        if not self._costly(format.encoding):
+            return self._cache(format, self._render(format))
+        if quota.may_encode:
+            with quota.encoding():
+                return self._cache(format, self._render(format))
+        format = output_format_for(format.names, PLAIN)
+        plain = self._cached_render(format) or self._cache(format, self._render(format))
+        if plain.error is not None:
+            return plain
+        return Rendered(plain.frames, RenderError.TOO_COSTLY, TOO_COSTLY)
 
-        Others who want the same form get it without cost.
-        """
-        wish, allowance = listener.wish, listener.allowance
-        if not self._costly(wish.form):
-            return self._keep(wish, self._make(wish))
-        if allowance.may_form:
-            with allowance.forming():
-                return self._keep(wish, self._make(wish))
-        listener.plainly()
-        wish = output_format_for(wish.names, PLAIN)
-        return self._found(wish) or self._keep(wish, self._make(wish))
-
-    def _costly(self, form: MessageEncoding) -> bool:
-        if form.compression in ("cbor", "cbor-raw"):
-            return form.compression == "cbor" and not self.converter.cdr
-        if form == PLAIN:
+    def _costly(self, encoding: MessageEncoding) -> bool:
+        if encoding.compression in ("cbor", "cbor-raw"):
+            return encoding.compression == "cbor" and not self.converter.cdr
+        if encoding == PLAIN:
             return False
-        body = self._in("json")
-        return not isinstance(body, SwitchboardError) and form.costly(len(body) + _HEAD)
+        body = self._body_in("json")
+        return not isinstance(body, SwitchboardError) and encoding.costly(len(body) + _HEAD_BYTES)
 
-    def _make(self, wish: OutputFormat) -> Rendered:
-        compression = wish.form.compression
+    def _render(self, format: OutputFormat) -> Rendered:
+        compression = format.encoding.compression
         language = "cbor" if compression == "cbor" else "json"
-        flaw, words = None, ""
+        error, words = None, ""
         if compression == "cbor-raw":
             if self.converter.cdr:
                 language = compression
             else:
-                flaw, words = (
-                    RenderError.NOT_CDR,
-                    "its messages are JSON, not CDR, so cbor-raw is plain JSON here",
-                )
-        if language == "cbor" and not self.converter.cdr and self.size > encodings.MOST_CBOR:
-            language, flaw = "json", RenderError.TOO_LARGE
-            words = f"JSON messages longer than {encodings.MOST_CBOR} bytes are sent as JSON, not as CBOR"
-        body = self._in(language)
+                error = RenderError.NOT_CDR
+                words = "its messages are JSON, not CDR, so cbor-raw is plain JSON here"
+        if language == "cbor" and not self.converter.cdr and self.size > encodings.MAX_CBOR:
+            language, error = "json", RenderError.TOO_LARGE
+            words = f"JSON messages longer than {encodings.MAX_CBOR} bytes are sent as JSON, not as CBOR"
+        body = self._body_in(language)
         if isinstance(body, SwitchboardError):
             return Rendered(None, RenderError.BROKEN, f"a message can't be converted: {body}")
         if language != "json":
-            return Rendered(
-                b"".join(websocket_frames.binary(encodings.publish(name, body)) for name in wish.names)
-            )
-        texts = [rosbridge.publish(name, body) for name in wish.names]
+            messages = [websocket_frames.binary(encodings.publish(name, body)) for name in format.names]
+            return Rendered(b"".join(messages))
+        texts = [rosbridge.publish(name, body) for name in format.names]
         if compression == "png":
-            if len(body) <= encodings.MOST_PNG:
-                texts = [self._picture(name, text) for name, text in zip(wish.names, texts, strict=True)]
+            if len(body) <= encodings.MAX_PNG:
+                texts = [self._png(name, text) for name, text in zip(format.names, texts, strict=True)]
             else:
-                flaw = RenderError.TOO_LARGE
-                words = (
-                    f"messages longer than {encodings.MOST_PNG} bytes are not sent as PNG but as plain JSON"
-                )
-        if len(texts) == 1:
-            return Rendered(divided(texts[0], wish.form.fragment_size), flaw, words)
-        return Rendered(b"".join(divided(each, wish.form.fragment_size) for each in texts), flaw, words)
+                error = RenderError.TOO_LARGE
+                words = f"messages longer than {encodings.MAX_PNG} bytes are sent as plain JSON, not as PNG"
+        frames = [text_frames(each, format.encoding.fragment_size) for each in texts]
+        return Rendered(frames[0] if len(frames) == 1 else b"".join(frames), error, words)
 
-    def _in(self, language: str) -> bytes | SwitchboardError:
+    def _body_in(self, language: str) -> bytes | SwitchboardError:
         if language == "json":
             if self._json is None:
-                self._json = self._converted(language)
+                self._json = self._convert(language)
             return self._json
-        if self._others is None:
-            self._others = {}
-        found = self._others.get(language)
+        if self._other_bodies is None:
+            self._other_bodies = {}
+        found = self._other_bodies.get(language)
         if found is None:
-            found = self._others[language] = self._converted(language)
+            found = self._other_bodies[language] = self._convert(language)
         return found
 
-    def _converted(self, language: str) -> bytes | SwitchboardError:
+    def _convert(self, language: str) -> bytes | SwitchboardError:
         if language == "cbor-raw":
-            return encodings.raw(self.stamp, self.body)
+            return encodings.raw(self.ros_time_ns, self.body)
         try:
             return self.converter.convert(language, self.body)
         except SwitchboardError as error:
-            self.converter.failed(str(error))
+            self.converter.on_failure(str(error))
             return error
 
-    def _picture(self, name: str, text: bytes) -> bytes:
-        if self._pictures is None:
-            self._pictures = {}
-        found = self._pictures.get(name)
+    def _png(self, name: str, text: bytes) -> bytes:
+        if self._pngs is None:
+            self._pngs = {}
+        found = self._pngs.get(name)
         if found is None:
-            found = self._pictures[name] = encodings.encode(text)
+            found = self._pngs[name] = encodings.png(text)
         return found
 
-    def _keep(self, wish: OutputFormat, ready: Rendered) -> Rendered:
-        """Latched samples stay for long: what was made ready of them must not grow with what clients think of."""
-        if self._ready is None:
-            self._ready = {}
-        self._ready[wish] = ready
-        self._ready_bytes += len(ready.frames or b"")
-        while self._ready_bytes > 4 * self.size + _SPARE and len(self._ready) > 1:
-            gone = self._ready.pop(next(iter(self._ready)))
-            self._ready_bytes -= len(gone.frames or b"")
-        return ready
+    def _cache(self, format: OutputFormat, rendered: Rendered) -> Rendered:
+        """Cache a rendered sample, within bounds: latched samples stay long, and clients choose the formats."""
+        if self._cached is None:
+            self._cached = {}
+        self._cached[format] = rendered
+        self._cached_bytes += len(rendered.frames or b"")
+        while self._cached_bytes > 4 * self.size + _SPARE_BYTES and len(self._cached) > 1:
+            gone = self._cached.pop(next(iter(self._cached)))
+            self._cached_bytes -= len(gone.frames or b"")
+        return rendered
 
 
-def _decoded(body: bytes) -> object:
+def _json_from_json(body: bytes) -> bytes:
     if len(body) > limits.JSON_BODY:
-        raise Invalid(f"JSON of {len(body)} bytes; a sample in JSON may have {limits.JSON_BODY}")
-    return jsontext.decode_any(body)
+        raise _too_large(body)
+    return jsontext.recode(body)
 
 
-_ANEW: dict[str, Reader] = {
-    "json": lambda body: jsontext.encode(_decoded(body)),
-    "cbor": lambda body: cbor2.dumps(_decoded(body)),
-}
-"""A robot's own JSON, decoded and written anew: what goes out is well-formed whatever came in."""
+def _cbor_from_json(body: bytes) -> bytes:
+    if len(body) > limits.JSON_BODY:
+        raise _too_large(body)
+    return cbor2.dumps(jsontext.decode_any(body))
+
+
+def _too_large(body: bytes) -> Invalid:
+    return Invalid(f"JSON of {len(body)} bytes; a sample in JSON may have {limits.JSON_BODY}")
+
+
+_REENCODERS: dict[str, Reader] = {"json": _json_from_json, "cbor": _cbor_from_json}
+"""JSON of a robot is decoded and encoded again, so that clients get well-formed JSON only."""

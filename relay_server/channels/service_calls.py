@@ -1,4 +1,4 @@
-"""Calls of services that clients offer, from the robot's graph and from other clients."""
+"""Service calls: to the robot, and to clients that offer services, from its graph and from other clients."""
 
 from __future__ import annotations
 
@@ -13,218 +13,221 @@ from twisted.python.failure import Failure
 
 from relay_protocol import jsontext, limits, link, rosbridge
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
-from relay_server.channels.advertisements import ClientAdvertisement, ClientAdvertisements, Provider
-from relay_server.channels.payloads import PayloadCodec
-from relay_server.channels.robot_link import ChannelPort, RequestContext, RobotLinkState
+from relay_server.channels.encodings import PayloadCodec
+from relay_server.channels.link_state import ChannelLinkPort, RobotLinkState
+from relay_server.channels.members import RequestContext
+from relay_server.channels.offered_services import OfferedService, OfferedServices, Provider
 from relay_server.common.clock import Clock, Timer, cancel
 from relay_server.common.send_queue import CONTROL_BYTES
 
-WAITING = 256
-"""Calls and goals that may wait for one client."""
+MAX_WAITING = 256
+"""Most calls and goals that wait for one client."""
 
-WAITING_BYTES = CONTROL_BYTES // 4 * 3
-"""Their arguments together. A client that reads slowly is not cut for what others ask of it."""
+MAX_WAITING_BYTES = CONTROL_BYTES // 4 * 3
+"""Most bytes of their arguments: a client that reads slowly must not be disconnected because of calls of others."""
 
-PLACE_SECONDS = 30.0
-"""What nobody waits for any more keeps its place for so long, or until it is answered: it may not be read yet."""
+ABANDONED_SECONDS = 30.0
+"""Seconds that an unanswered request still counts after its requester has given up, as it may not be read yet."""
 
 
 class PendingRequest(ABC):
-    """One call or goal on its way to the client that offers the service or action.
+    """A call or goal that was sent to the client that offers the service or action.
 
-    :param id: unguessable; only the client that was asked knows it
+    :param id: unguessable; only this client knows it
     :param args: JSON
     """
 
-    def __init__(self, id: str, offer: ClientAdvertisement, args: bytes) -> None:
+    def __init__(self, id: str, offered: OfferedService, args: bytes) -> None:
         self.id = id
-        self.offer = offer
+        self.offered = offered
         self.size = len(args)
-        self.fading: Timer | None = None
+        self.abandoned: Timer | None = None
 
     @abstractmethod
     def withdrawn(self, reason: str) -> None:
         """The client will never answer."""
 
 
-E = TypeVar("E", bound=PendingRequest)
+R = TypeVar("R", bound=PendingRequest)
 
 
 class PendingRequests:
-    """All of one channel.
+    """All pending requests of one channel.
 
-    :param new_id: makes an unguessable text
+    :param new_id: returns an unguessable text
     """
 
     def __init__(self, clock: Clock, new_id: Callable[[], str]) -> None:
         self._clock = clock
         self.new_id = new_id
-        self._of: dict[Provider, dict[str, PendingRequest]] = {}
+        self._by_client: dict[Provider, dict[str, PendingRequest]] = {}
 
-    def add(self, errand: PendingRequest) -> None:
-        """One more.
+    def add(self, request: PendingRequest) -> None:
+        """Add a request.
 
-        :raises Unavailable: the client has too much to do
+        :raises Unavailable: too many requests, or too many bytes, wait for the client
         """
-        offer = errand.offer
-        waiting = self._of.get(offer.member, {})
-        if len(waiting) >= WAITING:
-            raise Unavailable(f"{WAITING} calls and goals wait for the client that offers {offer.name}")
-        if errand.size + sum(each.size for each in waiting.values()) > WAITING_BYTES:
+        offered = request.offered
+        waiting = self._by_client.get(offered.member, {})
+        if len(waiting) >= MAX_WAITING:
+            raise Unavailable(f"{MAX_WAITING} calls and goals wait for the client that offers {offered.name}")
+        if request.size + sum(each.size for each in waiting.values()) > MAX_WAITING_BYTES:
             raise Unavailable(
-                f"this is too large for the client that offers {offer.name}, with what waits for it already"
+                f"this is too large for the client that offers {offered.name}, with what waits for it already"
             )
-        self._of.setdefault(offer.member, {})[errand.id] = errand
+        self._by_client.setdefault(offered.member, {})[request.id] = request
 
-    def find(self, member: Provider, id: rosbridge.Id, kind: type[E]) -> E:
-        """What this client was asked under this id.
+    def find(self, member: Provider, id: rosbridge.Id, kind: type[R]) -> R:
+        """The request that was sent to a client with an id.
 
-        :raises Refused: nothing; others' ids are not told from unknown ones
+        :raises Refused: there is none; ids of other clients give the same answer
         """
-        errand = self._of.get(member, {}).get(str(id))
-        if not isinstance(errand, kind):
-            raise Refused(f"you were asked nothing under the id '{str(id)[:80]}', or it is over")
-        return errand
+        request = self._by_client.get(member, {}).get(str(id))
+        if not isinstance(request, kind):
+            raise Refused(f"no call or goal with the id '{str(id)[:80]}' waits for you")
+        return request
 
-    def remove(self, errand: PendingRequest) -> None:
-        """It is answered, or its time is over."""
-        cancel(errand.fading)
-        waiting = self._of.get(errand.offer.member, {})
-        waiting.pop(errand.id, None)
+    def remove(self, request: PendingRequest) -> None:
+        """Remove a request that was answered or has timed out."""
+        cancel(request.abandoned)
+        waiting = self._by_client.get(request.offered.member, {})
+        waiting.pop(request.id, None)
         if not waiting:
-            self._of.pop(errand.offer.member, None)
+            self._by_client.pop(request.offered.member, None)
 
-    def fade(self, errand: PendingRequest) -> None:
-        """Nobody waits for the answer any more."""
-        if errand.fading is None and errand.id in self._of.get(errand.offer.member, {}):
-            errand.fading = self._clock.callLater(PLACE_SECONDS, self.remove, errand)
+    def abandon(self, request: PendingRequest) -> None:
+        """The requester does not wait any more; the request counts for :data:`ABANDONED_SECONDS`."""
+        if request.abandoned is None and request.id in self._by_client.get(request.offered.member, {}):
+            request.abandoned = self._clock.callLater(ABANDONED_SECONDS, self.remove, request)
 
-    def offer_ended(self, offer: ClientAdvertisement, reason: str) -> None:
-        """What the offering client was asked will not be answered."""
-        for errand in list(self._of.get(offer.member, {}).values()):
-            if errand.offer is offer:
-                self.remove(errand)
-                errand.withdrawn(reason)
+    def offer_ended(self, offered: OfferedService, reason: str) -> None:
+        """End the requests for a service or action that is not offered any more."""
+        for request in list(self._by_client.get(offered.member, {}).values()):
+            if request.offered is offered:
+                self.remove(request)
+                request.withdrawn(reason)
 
 
-PENDING = 1024
-"""Calls under way on one robot."""
+MAX_CALLS = 1024
+"""Most calls of clients that wait for one robot."""
 
 CANCEL_GOALS = "/_action/cancel_goal"
-"""How the name of the service ends by which an action takes cancellations (design.ros2.org, actions)."""
+"""Suffix of the name of the service by which an action's goals are cancelled (design.ros2.org, actions)."""
 
 GRACE = 1.0
-"""The robot gives up by itself at the timeout; this much later the relay does, seconds."""
+"""Seconds after its timeout at which the relay ends a call; the robot ends it at the timeout."""
 
 
 class ServiceCalls:
-    """Calls under way, each answered exactly once: by the robot, by time, or by the loss of the link."""
+    """Calls of clients. Each is answered exactly once: by the robot, at its timeout, or when the link is lost."""
 
     def __init__(
         self,
         clock: Clock,
-        wire: RobotLinkState,
-        bodies: PayloadCodec,
-        offers: ClientAdvertisements,
-        served: ClientServiceCalls,
+        link_state: RobotLinkState,
+        codec: PayloadCodec,
+        offered_services: OfferedServices,
+        client_calls: ClientServiceCalls,
     ) -> None:
         self._clock = clock
-        self._wire = wire
-        self._bodies = bodies
-        self._offers = offers
-        self._served = served
+        self._link_state = link_state
+        self._codec = codec
+        self._offered_services = offered_services
+        self._client_calls = client_calls
         self._ids = itertools.count(1)
         self._pending: dict[str, Deferred[link.ServiceResponse]] = {}
 
     async def call(
-        self, service: str, type_name: str, args: bytes, seconds: float, sent: RequestContext
+        self, service: str, type_name: str, args: bytes, seconds: float, context: RequestContext
     ) -> bytes:
-        """Call a service of the robot, or of a client that offers it there.
+        """Call a service of the client that offers it, else of the robot.
 
-        :param type_name: as the client gave it; the graph's type wins
+        :param type_name: as the client gave it; the type in the graph has precedence
         :param args: JSON, an object or a list of the fields in order; may be empty
-        :param seconds: the robot has for its answer
+        :param seconds: most seconds until the answer
         :returns: the response as JSON
-        :raises Refused: it moves the robot, and may be too old when it could be sent
+        :raises Refused: it moves the robot, and may be too old by the time it can be sent
         :raises NotFound: no such service
-        :raises Invalid: arguments that do not fit its type
-        :raises Unavailable: no answer in time, the service said no, or the robot was lost
+        :raises Invalid: the arguments do not fit its type
+        :raises Unavailable: there was no answer in time, the service failed, or the link to the robot was lost
         """
-        offer = self._offers.standing(service)
-        if offer is not None:
-            return await self._ask_client(offer, args, seconds, sent)
+        offered = self._offered_services.find_usable(service)
+        if offered is not None:
+            return await self._call_client(offered, args, seconds, context)
         type_name = self._known_type(service) or type_name
         if not type_name:
-            raise NotFound(f"service {service} does not exist on robot {self._wire.robot.name}")
-        await self._bodies.ready(type_name)
-        sent.judge()
-        message = self._message(service, type_name, args, seconds, sent)
+            raise NotFound(f"service {service} does not exist on robot {self._link_state.robot.name}")
+        await self._codec.ready(type_name)
+        context.check_age()
+        message = self._message(service, type_name, args, seconds, context)
         response = await self._exchange(message, seconds)
         if not response.result:
             raise Unavailable(response.reason or f"service {service} failed")
         return self._values(type_name, response)
 
     def _known_type(self, service: str) -> str:
-        """By the graph, which does not show the hidden services of actions; roslibjs cancels all goals by one."""
-        graph = self._wire.robot.graph
+        """The type in the graph. Actions' hidden services are not in it; roslibjs cancels all goals by one of them."""
+        graph = self._link_state.robot.graph
         action = service.removesuffix(CANCEL_GOALS)
         if action != service and graph.action_type(action):
             return "action_msgs/srv/CancelGoal"
         return graph.service_type(service) or ""
 
-    async def _ask_client(
-        self, offer: ClientAdvertisement, args: bytes, seconds: float, sent: RequestContext
+    async def _call_client(
+        self, offered: OfferedService, args: bytes, seconds: float, context: RequestContext
     ) -> bytes:
-        """What goes by the robot could come back only as a call without an answer when the client says no."""
-        await self._bodies.ready(offer.type)
-        sent.judge()
-        self._offers.check(offer)
-        request = self._bodies.from_client(f"{offer.type}_Request", args)
-        response = await self._served.ask(offer, request, seconds)
-        return self._bodies.to_client(f"{offer.type}_Response", response)
+        """Call a client directly. Through the robot, a refusal could only come back as a call without an answer."""
+        await self._codec.ready(offered.type)
+        context.check_age()
+        self._offered_services.check(offered)
+        request = self._codec.from_client(f"{offered.type}_Request", args)
+        response = await self._client_calls.call(offered, request, seconds)
+        return self._codec.to_client(f"{offered.type}_Response", response)
 
     def answered(self, response: link.ServiceResponse) -> None:
-        """The robot's answer; one nobody waits for is let go."""
+        """The robot has answered a call; an answer to no call is dropped."""
         waiting = self._pending.pop(response.id, None)
         if waiting is not None:
             waiting.callback(response)
 
     def lost(self) -> None:
-        """The link is gone: no answer will come."""
+        """The link is lost: all calls fail."""
         pending, self._pending = self._pending, {}
         for waiting in pending.values():
-            waiting.errback(Unavailable(f"robot {self._wire.robot.name} lost its connection during the call"))
+            waiting.errback(
+                Unavailable(f"robot {self._link_state.robot.name} lost its connection during the call")
+            )
 
     def _message(
-        self, service: str, type_name: str, args: bytes, seconds: float, sent: RequestContext
+        self, service: str, type_name: str, args: bytes, seconds: float, context: RequestContext
     ) -> link.CallService:
-        body = self._bodies.from_client(f"{type_name}_Request", args)
+        body = self._codec.from_client(f"{type_name}_Request", args)
         return link.CallService(
             id=str(next(self._ids)),
             service=service,
             type=type_name,
             timeout=seconds,
-            source=sent.source,
-            stamp=sent.stamp,
-            **self._bodies.args(body),
+            source=context.source,
+            stamp=context.earliest_sent,
+            **self._codec.args(body),
         )
 
     async def _exchange(self, message: link.CallService, seconds: float) -> link.ServiceResponse:
-        if len(self._pending) >= PENDING:
-            raise Unavailable(f"{PENDING} calls are waiting on this robot already")
-        if self._wire.link is None:
-            raise Unavailable(f"robot {self._wire.robot.name} is not connected")
+        if len(self._pending) >= MAX_CALLS:
+            raise Unavailable(f"{MAX_CALLS} calls are waiting on this robot already")
+        if self._link_state.link is None:
+            raise Unavailable(f"robot {self._link_state.robot.name} is not connected")
         waiting: Deferred[link.ServiceResponse] = Deferred()
         self._pending[message.id] = waiting
-        timer = self._clock.callLater(seconds + GRACE, self._late, message, seconds)
+        timer = self._clock.callLater(seconds + GRACE, self._timed_out, message, seconds)
         try:
-            self._wire.send(message)
+            self._link_state.send(message)
             return await waiting
         finally:
             self._pending.pop(message.id, None)
             cancel(timer)
 
-    def _late(self, message: link.CallService, seconds: float) -> None:
+    def _timed_out(self, message: link.CallService, seconds: float) -> None:
         waiting = self._pending.pop(message.id, None)
         if waiting is not None:
             waiting.errback(Unavailable(f"service {message.service} did not answer within {seconds:g} s"))
@@ -232,36 +235,39 @@ class ServiceCalls:
     def _values(self, type_name: str, response: link.ServiceResponse) -> bytes:
         try:
             part = f"{type_name}_Response"
-            return self._bodies.to_client(part, self._bodies.from_robot(part, response.cdr, response.values))
+            return self._codec.to_client(part, self._codec.from_robot(part, response.cdr, response.values))
         except SwitchboardError as error:
             raise Invalid(f"the robot's answer can't be read: {error}") from None
 
 
-GRAPH_CALLS = 1024
-"""Calls from one robot's graph that may be under way."""
+MAX_GRAPH_CALLS = 1024
+"""Most calls from one robot's graph that wait for clients."""
 
 LONGEST_CALL = 3600.0
-"""Most seconds a caller may give a service."""
+"""Longest timeout of a call, seconds."""
 
 
 def call_seconds(timeout: float | None) -> float:
-    """How long a call may take, by what the caller asked for."""
+    """Seconds that a call may take.
+
+    :param timeout: that the caller requested; none, 0 or less: the usual one
+    """
     return min(timeout, LONGEST_CALL) if timeout and timeout > 0 else limits.CALL_SECONDS
 
 
 class _ClientCall(PendingRequest):
-    """A call on its way to the client that offers the service."""
+    """A call that was sent to the client that offers the service."""
 
     waiting: Deferred[bytes] | None = None
-    late: Timer | None = None
+    timer: Timer | None = None
 
     def withdrawn(self, reason: str) -> None:
         """The client will never answer."""
-        self.settle(Unavailable(reason))
+        self.answer(Unavailable(reason))
 
-    def settle(self, answer: bytes | SwitchboardError) -> None:
+    def answer(self, answer: bytes | SwitchboardError) -> None:
         """Give the caller its answer, if it still waits."""
-        cancel(self.late)
+        cancel(self.timer)
         waiting, self.waiting = self.waiting, None
         if waiting is None:
             return
@@ -272,127 +278,134 @@ class _ClientCall(PendingRequest):
 
 
 class ClientServiceCalls:
-    """Each call is answered exactly once: by the client, by time, or because the client has gone."""
+    """Calls to clients that offer services.
+
+    Each is answered exactly once: by the client, at its timeout, or when the client has left.
+    """
 
     log = Logger()
 
     def __init__(
         self,
         clock: Clock,
-        wire: RobotLinkState,
-        bodies: PayloadCodec,
-        offers: ClientAdvertisements,
-        errands: PendingRequests,
+        link_state: RobotLinkState,
+        codec: PayloadCodec,
+        offered_services: OfferedServices,
+        pending: PendingRequests,
     ) -> None:
         self._clock = clock
-        self._wire = wire
-        self._bodies = bodies
-        self._offers = offers
-        self._errands = errands
+        self._link_state = link_state
+        self._codec = codec
+        self._offered_services = offered_services
+        self._pending = pending
         self._graph_calls: set[Deferred[None]] = set()
 
-    def ask(self, offer: ClientAdvertisement, request: bytes, seconds: float) -> Deferred[bytes]:
-        """Have the client that offers the service answer a request; cancel it when nobody wants the answer any more.
+    def call(self, offered: OfferedService, request: bytes, seconds: float) -> Deferred[bytes]:
+        """Call the client that offers the service; cancel the result when the answer is not needed any more.
 
-        :param request: a body, see :class:`PayloadCodec`; the answer is one too
-        :param seconds: the client has for its answer
-        :raises Invalid: the request is no such body
-        :raises Unavailable: the client has too much to do; the answer fails so when there is none or it says no
+        :param request: a body, see :class:`PayloadCodec`
+        :param seconds: most seconds until the answer
+        :returns: fires with a body; fails with :class:`Unavailable` when the client does not answer or refuses
+        :raises Invalid: the request is no body of this type
+        :raises Unavailable: too much waits for the client
         """
-        args = self._bodies.to_client(f"{offer.type}_Request", request)
-        call = _ClientCall(self._errands.new_id(), offer, args)
-        self._errands.add(call)
-        waiting = call.waiting = Deferred(lambda _: self._give_up(call))
-        call.late = self._clock.callLater(seconds, self._too_late, call, seconds)
-        offer.member.say(rosbridge.call_service(offer.written, call.id, args))
+        args = self._codec.to_client(f"{offered.type}_Request", request)
+        call = _ClientCall(self._pending.new_id(), offered, args)
+        self._pending.add(call)
+        waiting = call.waiting = Deferred(lambda _: self._cancelled(call))
+        call.timer = self._clock.callLater(seconds, self._timed_out, call, seconds)
+        offered.member.port.call_service(offered.written, call.id, args)
         return waiting
 
     def answered(self, member: Provider, answer: rosbridge.ServiceResponse) -> None:
         """A client answers a call.
 
-        :raises Refused: it was not asked that
-        :raises Invalid: the answer does not fit the type; the caller is told too
+        :raises Refused: the client has no call of this id
+        :raises Invalid: the answer does not fit the type; the caller gets the reason too
         """
-        call = self._errands.find(member, answer.id, _ClientCall)
-        self._errands.remove(call)
-        name, text = call.offer.name, bytes(answer.values or b"")
+        call = self._pending.find(member, answer.id, _ClientCall)
+        self._pending.remove(call)
+        name, text = call.offered.name, bytes(answer.values or b"")
         try:
             if not answer.result:
-                reason = reason_in(text) or f"the client that offers {name} could not do it"
-                call.settle(Unavailable(reason))
+                reason = refusal_reason(text) or f"the client that offers {name} could not do it"
+                call.answer(Unavailable(reason))
                 return
-            body = self._bodies.from_client(f"{call.offer.type}_Response", text)
+            body = self._codec.from_client(f"{call.offered.type}_Response", text)
         except SwitchboardError as error:
-            call.settle(Unavailable(f"the client that offers {name} gave an unfit answer: {error}"))
+            call.answer(Unavailable(f"the client that offers {name} gave a wrong answer: {error}"))
             raise
-        call.settle(body)
+        call.answer(body)
 
-    def called(self, message: link.CallService) -> None:
+    def call_from_graph(self, message: link.CallService) -> None:
         """The graph calls a service that a client offers."""
-        origin = self._wire.link
+        origin = self._link_state.link
         if origin is None:
             return
-        if len(self._graph_calls) >= GRAPH_CALLS:
-            origin.send(_no(message, f"{GRAPH_CALLS} calls from the graph are under way already"))
+        if len(self._graph_calls) >= MAX_GRAPH_CALLS:
+            origin.send(_refusal(message, f"{MAX_GRAPH_CALLS} calls from the graph are under way already"))
             return
         running = Deferred.fromCoroutine(self._serve(message, origin))
         self._graph_calls.add(running)
         running.addErrback(self._unexpected, message, origin)
-        running.addBoth(self._over, running)
+        running.addBoth(self._graph_call_ended, running)
 
     def lost(self) -> None:
-        """The link is gone, and with it those who called over it."""
+        """The link is lost, and with it the callers in the graph."""
         for running in list(self._graph_calls):
             running.cancel()
 
-    async def _serve(self, message: link.CallService, origin: ChannelPort) -> None:
+    async def _serve(self, message: link.CallService, origin: ChannelLinkPort) -> None:
         try:
             body = await self._answer(message)
         except SwitchboardError as error:
-            response = _no(message, str(error))
+            response = _refusal(message, str(error))
         else:
-            response = link.ServiceResponse(id=message.id, result=True, **self._bodies.values(body))
+            response = link.ServiceResponse(id=message.id, result=True, **self._codec.values(body))
         try:
             origin.send(response)
         except Unavailable as error:
-            origin.send(_no(message, str(error)))
+            origin.send(_refusal(message, str(error)))
 
     async def _answer(self, message: link.CallService) -> bytes:
-        offer = self._offers.standing(message.service)
-        if offer is None:
+        offered = self._offered_services.find_usable(message.service)
+        if offered is None:
             raise NotFound(f"no client offers the service {message.service}")
-        await self._bodies.ready(offer.type)
-        self._offers.check(offer)
-        request = self._bodies.from_robot(f"{offer.type}_Request", message.cdr, message.args)
-        return await self.ask(offer, request, call_seconds(message.timeout))
+        await self._codec.ready(offered.type)
+        self._offered_services.check(offered)
+        request = self._codec.from_robot(f"{offered.type}_Request", message.cdr, message.args)
+        return await self.call(offered, request, call_seconds(message.timeout))
 
-    def _give_up(self, call: _ClientCall) -> None:
+    def _cancelled(self, call: _ClientCall) -> None:
         call.waiting = None
-        cancel(call.late)
-        self._errands.fade(call)
+        cancel(call.timer)
+        self._pending.abandon(call)
 
-    def _too_late(self, call: _ClientCall, seconds: float) -> None:
-        self._errands.fade(call)
-        call.settle(
-            Unavailable(f"the client that offers {call.offer.name} did not answer within {seconds:g} s")
+    def _timed_out(self, call: _ClientCall, seconds: float) -> None:
+        self._pending.abandon(call)
+        call.answer(
+            Unavailable(f"the client that offers {call.offered.name} did not answer within {seconds:g} s")
         )
 
-    def _unexpected(self, failure: Failure, message: link.CallService, origin: ChannelPort) -> None:
+    def _unexpected(self, failure: Failure, message: link.CallService, origin: ChannelLinkPort) -> None:
         if failure.check(CancelledError):
             return
         self.log.failure("a call of {service} from the graph failed", failure, service=message.service)
-        origin.send(_no(message, "the relay failed on this call; its log tells more"))
+        origin.send(_refusal(message, "the relay failed on this call; see its log"))
 
-    def _over(self, _: Any, running: Deferred[None]) -> None:
+    def _graph_call_ended(self, _: Any, running: Deferred[None]) -> None:
         self._graph_calls.discard(running)
 
 
-def reason_in(text: bytes) -> str:
-    """Why a client says no, out of the ``values`` of its answer: a string, or whatever else it sent."""
+def refusal_reason(text: bytes) -> str:
+    """The reason of a client's refusal.
+
+    :param text: JSON, the ``values`` of its answer: usually a string
+    """
     value = jsontext.decode_any(text) if text else ""
-    words = value if isinstance(value, str) else jsontext.encode(value).decode()
-    return words[: limits.WORDS]
+    reason = value if isinstance(value, str) else jsontext.encode(value).decode()
+    return reason[: limits.TEXT_LENGTH]
 
 
-def _no(message: link.CallService, reason: str) -> link.ServiceResponse:
+def _refusal(message: link.CallService, reason: str) -> link.ServiceResponse:
     return link.ServiceResponse(id=message.id, result=False, reason=reason)

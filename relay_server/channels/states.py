@@ -1,4 +1,4 @@
-"""A channel's life as a table: where it can be, what can happen, and what follows."""
+"""The lifecycle of a channel as a table of states, events and following states."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import enum
 
 
 class ChannelState(enum.Enum):
-    """Where a channel is in its life."""
+    """State of a channel."""
 
     NEW = "new"
     WAITING = "waiting for the robot"
@@ -16,28 +16,28 @@ class ChannelState(enum.Enum):
 
 
 class ChannelEvent(enum.Enum):
-    """What happens to a channel."""
+    """Event of a channel; the values are written to the log."""
 
-    WANTED = "somebody is here"
+    ATTACHED = "a session is attached"
     ROBOT_ONLINE = "the robot registered"
     ROBOT_OFFLINE = "the robot is gone"
     JOINED = "the robot joined"
     LINK_LOST = "the channel's link broke"
-    LATE = "the robot did not join in time"
-    SHUT = "nobody needs it any more"
+    JOIN_TIMEOUT = "the robot did not join in time"
+    CLOSE = "no session needs it any more"
 
 
 NEXT: dict[tuple[ChannelState, ChannelEvent], ChannelState] = {
-    (ChannelState.NEW, ChannelEvent.WANTED): ChannelState.WAITING,
+    (ChannelState.NEW, ChannelEvent.ATTACHED): ChannelState.WAITING,
     (ChannelState.WAITING, ChannelEvent.ROBOT_ONLINE): ChannelState.OPENING,
-    (ChannelState.WAITING, ChannelEvent.SHUT): ChannelState.CLOSED,
+    (ChannelState.WAITING, ChannelEvent.CLOSE): ChannelState.CLOSED,
     (ChannelState.OPENING, ChannelEvent.JOINED): ChannelState.OPEN,
     (ChannelState.OPENING, ChannelEvent.ROBOT_ONLINE): ChannelState.OPENING,
     (ChannelState.OPENING, ChannelEvent.ROBOT_OFFLINE): ChannelState.WAITING,
-    (ChannelState.OPENING, ChannelEvent.LATE): ChannelState.OPENING,
-    (ChannelState.OPENING, ChannelEvent.SHUT): ChannelState.CLOSED,
+    (ChannelState.OPENING, ChannelEvent.JOIN_TIMEOUT): ChannelState.OPENING,
+    (ChannelState.OPENING, ChannelEvent.CLOSE): ChannelState.CLOSED,
     (ChannelState.OPEN, ChannelEvent.LINK_LOST): ChannelState.OPENING,
     (ChannelState.OPEN, ChannelEvent.ROBOT_OFFLINE): ChannelState.WAITING,
-    (ChannelState.OPEN, ChannelEvent.SHUT): ChannelState.CLOSED,
+    (ChannelState.OPEN, ChannelEvent.CLOSE): ChannelState.CLOSED,
 }
 """An event that is not listed for a state changes nothing."""

@@ -1,4 +1,4 @@
-"""The command ``switchboard``: runs the relay, and administers it, also while it runs."""
+"""The command ``switchboard``: runs the relay and administers it, also while it runs."""
 
 from __future__ import annotations
 
@@ -7,37 +7,65 @@ from pathlib import Path
 
 import click
 
-from relay_server.cli.app import App, examples
-from relay_server.cli.lazy import CommandEntry, LazyGroup
+from relay_server.cli.app import App, CommandEntry, LazyGroup, examples
 
 _COMMANDS = {
     "serve": CommandEntry("relay_server.cli.serve", "serve", "Run the relay."),
-    "demo": CommandEntry("relay_server.cli.demo", "demo", "Run a relay with two simulated robots."),
+    "demo": CommandEntry("relay_server.cli.serve", "demo", "Run a relay with two simulated robots."),
     "status": CommandEntry(
-        "relay_server.cli.status", "status", "Show which robots are online, and with whom."
+        "relay_server.cli.status", "status", "Show the robots that are online, and their users."
     ),
     "stop": CommandEntry("relay_server.cli.stop", "stop", "Stop a robot, or all of them."),
-    "resume": CommandEntry("relay_server.cli.stop", "resume", "Let a robot that was stopped move again."),
-    "realm": CommandEntry("relay_server.cli.realms", "realm", "Keep users and robots apart."),
+    "resume": CommandEntry("relay_server.cli.stop", "resume", "Let a stopped robot move again."),
+    "cluster": CommandEntry(
+        "relay_server.cli.cluster", "cluster", "Show the relays that serve the same robots."
+    ),
+    "drain": CommandEntry(
+        "relay_server.cli.cluster", "drain", "Move robots and clients to the other relays of a cluster."
+    ),
+    "realm": CommandEntry("relay_server.cli.realms", "realm", "Keep users and robots in separate realms."),
     "user": CommandEntry("relay_server.cli.users", "user", "Add, list, change and remove users."),
-    "group": CommandEntry("relay_server.cli.groups", "group", "Give users rights together."),
+    "group": CommandEntry("relay_server.cli.users", "group", "Put users into groups that share rights."),
     "robot": CommandEntry(
-        "relay_server.cli.robots", "robot", "Add, list and remove robots and their keys; orders to many."
+        "relay_server.cli.robots",
+        "robot",
+        "Add, list and remove robots and their keys; send orders to many robots.",
     ),
-    "right": CommandEntry("relay_server.cli.rights", "right", "Say who may do what on which robot."),
+    "module": CommandEntry(
+        "relay_server.cli.modules",
+        "module",
+        "List, start, stop and restart modules of a robot; read their logs.",
+    ),
+    "file": CommandEntry("relay_server.cli.files", "file", "List, read, add and remove files of robots."),
+    "pipe": CommandEntry(
+        "relay_server.cli.pipes", "pipe", "Carry topics from robot to robot: list, add, start, stop, remove."
+    ),
+    "worker": CommandEntry(
+        "relay_server.cli.worker", "worker", "Run functions for a relay, as a worker of its Dask scheduler."
+    ),
+    "top": CommandEntry("relay_server.cli.modules", "top", "Watch the processes of a robot."),
+    "right": CommandEntry("relay_server.cli.users", "right", "Grant, list and revoke rights on robots."),
+    "role": CommandEntry("relay_server.cli.roles", "role", "Load, show, save, query and remove Roles."),
     "token": CommandEntry("relay_server.cli.tokens", "token", "Create, list and revoke access tokens."),
-    "program": CommandEntry(
-        "relay_server.cli.oauth_clients", "program", "Add, list and revoke programs with key and secret."
+    "foxglove-url": CommandEntry(
+        "relay_server.cli.foxglove_urls",
+        "foxglove_url",
+        "Create, list and revoke URLs by which Foxglove and Lichtblick open a robot.",
     ),
-    "alerts": CommandEntry("relay_server.cli.alerts", "alerts", "Show alerts, and say who is told how."),
-    "events": CommandEntry("relay_server.cli.events", "events", "Show what happened of late."),
+    "oauth-client": CommandEntry(
+        "relay_server.cli.tokens",
+        "oauth_client",
+        "Add, list and revoke OAuth clients, which log in with a key and a secret.",
+    ),
+    "alerts": CommandEntry("relay_server.cli.alerts", "alerts", "Show alerts, and set up notifications."),
+    "events": CommandEntry("relay_server.cli.events", "events", "Show recent events."),
     "directory": CommandEntry(
         "relay_server.cli.directory",
         "directory",
-        "Show which services and applications there are, and where.",
+        "Show registered services and applications and their addresses.",
     ),
-    "audit": CommandEntry("relay_server.cli.audit", "audit", "Read and verify the audit log."),
-    "db": CommandEntry("relay_server.cli.database", "db", "Look after the database."),
+    "audit": CommandEntry("relay_server.cli.events", "audit", "Read and verify the audit log."),
+    "db": CommandEntry("relay_server.cli.serve", "db", "Create or upgrade the database."),
 }
 
 _DEFAULT_DATA = Path("~/.local/share/switchboard")
@@ -62,23 +90,23 @@ _DEFAULT_DATA = Path("~/.local/share/switchboard")
     default=_DEFAULT_DATA,
     show_default=True,
     show_envvar=True,
-    help="Folder of the database and the relay's keys.",
+    help="Folder with the database and the relay's keys.",
 )
 @click.option(
     "--db",
     metavar="URL",
     envvar="SWITCHBOARD_DB",
     show_envvar=True,
-    help="Another database than SQLite in the data folder: postgresql://USER@HOST/NAME. "
-    "A password in it belongs in the variable, not on the command line.",
+    help="A database other than SQLite in the data folder: postgresql://USER@HOST/NAME. "
+    "Put a password into the variable, never on the command line.",
 )
 @click.version_option(package_name="robot-switchboard", prog_name="switchboard")
 @click.pass_context
 def main(ctx: click.Context, data: Path, db: str | None) -> None:
     """Reach, watch and drive robots through a relay of your own.
 
-    Changes take effect at once, also in a relay that is running and in what is open there.
+    Changes take effect at once. A running relay applies them to open connections too.
     """
-    # Whatever the umask was: what is made here is its owner's alone.
+    # Files belong to the current user alone, whatever the umask was.
     os.umask(0o077)
     ctx.obj = App(data.expanduser(), db)

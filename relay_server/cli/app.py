@@ -1,47 +1,49 @@
-"""What every command gets: where the data is, the database, and the one way to change something in it."""
+"""Shared by all commands: the data folder, the database, audited changes, names with realms, and options.
+
+The top-level command group: it imports a command only when it is called, and turns errors into exit codes.
+"""
 
 from __future__ import annotations
 
 import os
 import pwd
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import IO, Any, NamedTuple, Protocol, TypeVar
 
 import click
 from sqlalchemy.orm import Session
 
+from relay_db import queries
+from relay_db.engine import Database
+from relay_db.names import normal_name, normalise
 from relay_db.queries import GroupRecord, RobotRecord, UserRecord
-from relay_protocol.errors import NotFound
-from relay_protocol.realms import parted
-from relay_server.cli.control_socket import notify_relay
+from relay_db.queries.realms import realm_id
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_protocol.realms import DEFAULT_REALM, split_name
+from relay_protocol.scopes import Scope
+from relay_protocol.text import escape_unprintable
+from relay_server.cli.admin_socket_client import notify_relay
 from relay_server.realms.changes import AuditedChange
-
-if TYPE_CHECKING:
-    from sqlalchemy.orm import Session
-
-    from relay_db.engine import Database
-    from relay_db.queries import GroupRecord, RobotRecord, UserRecord
 
 
 class LocalChange(AuditedChange):
-    """A change by who may run ``switchboard`` on the relay's machine."""
+    """A change made with ``switchboard`` on the relay's machine."""
 
     def __init__(self, session: Session) -> None:
         super().__init__(session, f"cli:{os_user()}", "local")
 
     def user(self, name: str) -> UserRecord:
-        """:raises NotFound: no such user"""
-        return user_of(self.session, name)
+        return get_user(self.session, name)
 
     def group(self, name: str) -> GroupRecord:
-        """:raises NotFound: no such group"""
-        return group_of(self.session, name)
+        return get_group(self.session, name)
 
     def robot(self, name: str) -> RobotRecord:
-        """:raises NotFound: no such robot"""
-        return robot_of(self.session, name)
+        return get_robot(self.session, name)
 
 
 _Record = TypeVar("_Record")
@@ -51,7 +53,7 @@ class App:
     """Settings of one run of the command line.
 
     :param data: the data folder
-    :param database_url: None for SQLite in the data folder
+    :param database_url: ``None`` for SQLite in the data folder
     """
 
     def __init__(self, data: Path, database_url: str | None = None) -> None:
@@ -60,17 +62,14 @@ class App:
 
     @property
     def database_url(self) -> str:
-        """Of the database to use."""
         return self._url or f"sqlite:///{self.data.absolute() / 'switchboard.db'}"
 
     @contextmanager
     def database(self) -> Iterator[Database]:
-        """The database, created and brought up to date if need be.
+        """The database, created or upgraded if necessary.
 
-        :raises Unavailable: it can't be reached, or was written by newer code
+        :raises Unavailable: it cannot be reached, or was written by a newer version
         """
-        from relay_db.engine import Database
-
         database = Database(self.database_url)
         try:
             database.upgrade()
@@ -80,41 +79,54 @@ class App:
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
-        """A session to look things up with."""
+        """A session for queries."""
         with self.database() as database, database.reading() as session:
             yield session
 
     @contextmanager
     def change(self) -> Iterator[LocalChange]:
-        """One change with its audit entry; afterwards a running relay is told to look."""
+        """One change with its audit entry. A running relay is notified afterwards."""
 
         with self.database() as database, database.begin() as session:
             yield LocalChange(session)
         notify_relay(self.data)
 
 
-def user_of(session: Session, name: str) -> UserRecord:
-    """:param name: as ``toad@lab1``; without a realm one of the default one
-    :raises NotFound: no such user"""
-    from relay_db import queries
-
-    return _found(queries.find_user(session, *parted(name)), "user", name)
-
-
-def group_of(session: Session, name: str) -> GroupRecord:
-    """:param name: as of :func:`user_of`
-    :raises NotFound: no such group"""
-    from relay_db import queries
-
-    return _found(queries.find_group(session, *parted(name)), "group", name)
+def get_user(session: Session, name: str) -> UserRecord:
+    """:param name: as ``toad@lab1``; a name without a realm belongs to the default realm
+    :raises NotFound: no such user
+    """
+    return _found(queries.find_user(session, *split_name(name)), "user", name)
 
 
-def robot_of(session: Session, name: str) -> RobotRecord:
-    """:param name: as of :func:`user_of`
-    :raises NotFound: no such robot"""
-    from relay_db import queries
+def user_id(session: Session, name: str | None) -> int | None:
+    """The number of a user by whom a list is filtered; ``None`` for no filter.
 
-    return _found(queries.find_robot(session, *parted(name)), "robot", name)
+    :raises NotFound: no such user
+    """
+    return None if name is None else get_user(session, name).id
+
+
+def get_group(session: Session, name: str) -> GroupRecord:
+    """:param name: as for :func:`get_user`
+    :raises NotFound: no such group
+    """
+    return _found(queries.find_group(session, *split_name(name)), "group", name)
+
+
+def get_robot(session: Session, name: str) -> RobotRecord:
+    """:param name: as for :func:`get_user`
+    :raises NotFound: no such robot
+    """
+    return _found(queries.find_robot(session, *split_name(name)), "robot", name)
+
+
+def parse_scope(text: str | None) -> str | None:
+    """The option ``--scope`` in its normal form; ``None`` for all rights of the user.
+
+    :raises Invalid: it is not a scope
+    """
+    return None if text is None else str(Scope(text))
 
 
 def _found(record: _Record | None, what: str, name: str) -> _Record:
@@ -124,41 +136,197 @@ def _found(record: _Record | None, what: str, name: str) -> _Record:
 
 
 def os_user() -> str:
-    """Who runs this, by the system's own account of it; environment variables could say anything."""
+    """The name of the system's user. Environment variables are not asked, since they could be forged."""
     try:
         return pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
         return str(os.getuid())
 
 
+# --- names with realms: toad@lab1, --realm lab1 ----------------------------------------------------------
+
+
+_MORE_THAN_A_NAME = frozenset("*?[:")
+"""Characters of patterns and of groups of robots (``group:cleaners``)."""
+
+
+class _OfRealm(Protocol):
+    @property
+    def realm(self) -> str: ...
+
+
+_InRealm = TypeVar("_InRealm", bound=_OfRealm)
+
+
+def existing_realm(session: Session, realm: str) -> str:
+    """The normalised name of a realm that exists.
+
+    :raises NotFound: there is no such realm
+    """
+    try:
+        realm_id(session, realm)
+    except NotFound:
+        raise NotFound(
+            f"there is no realm '{realm}'; see 'switchboard realm list', or add it with 'switchboard realm add'"
+        ) from None
+    return normalise(realm)
+
+
+def new_name(session: Session, text: str) -> tuple[str, str]:
+    """The name and the realm of something new.
+
+    :raises NotFound: there is no such realm
+    """
+    name, realm = split_name(text)
+    return name, existing_realm(session, realm)
+
+
+def list_in_realm(
+    session: Session, query: Callable[[Session, str | None], Iterable[_InRealm]], realm: str | None
+) -> list[_InRealm]:
+    """The results of a query for one realm, or for all: the default realm first.
+
+    :raises NotFound: there is no such realm
+    """
+    found = query(session, None if realm is None else existing_realm(session, realm))
+    return sorted(found, key=lambda each: (each.realm != DEFAULT_REALM, each.realm))
+
+
+def resolve_realm(asked: Sequence[str], realm: str | None = None) -> tuple[str, list[str]]:
+    """The realm that all names of one request belong to, and the names without it.
+
+    :param asked: names, patterns, ``group:NAME``; a name may have its realm: ``mobile@lab2``
+    :param realm: the option ``--realm``; by default names without a realm belong to the default realm
+    :raises Invalid: they belong to several realms, a pattern or a group names one, or a realm's name is not
+        valid
+    """
+    wanted = DEFAULT_REALM if realm is None else _realm(realm)
+    realms = set() if realm is None else {wanted}
+    names = []
+    for each in asked:
+        name, at, _ = each.partition("@")
+        if at and not _MORE_THAN_A_NAME.isdisjoint(name):
+            raise Invalid(
+                f"'{each}' is not the name of one robot; write '{name}' and give its realm by --realm"
+            )
+        realms.add(_realm(split_name(each)[1]) if at else wanted)
+        names.append(name)
+    if len(realms) > 1:
+        several = " and ".join(f"'{each}'" for each in sorted(realms))
+        raise Invalid(f"these belong to the realms {several}; name one realm at a time")
+    return next(iter(realms), wanted), names
+
+
+def _realm(name: str) -> str:
+    return normal_name(name, "name of a realm")
+
+
+# --- options ----------------------------------------------------------------------------------------------
+
+
 pass_app = click.make_pass_decorator(App)
 
 json_option: Callable[[Any], Any] = click.option(
-    "--json", "as_json", is_flag=True, help="Print JSON, and nothing else, to stdout."
+    "--json", "as_json", is_flag=True, help="Print only JSON to stdout."
 )
 why_option: Callable[[Any], Any] = click.option(
     "--why",
     default="",
-    # What is no UTF-8 must not keep an order to stop from being understood.
+    # An order to stop must not fail because its reason is not UTF-8.
     callback=lambda _context, _option, why: why.encode("utf-8", "replace").decode(),
-    help="The reason, for the others and for the record.",
+    help="The reason, for other users and the audit log.",
+)
+number_argument: Callable[[Any], Any] = click.argument(
+    "number", metavar="ID", type=click.IntRange(min=1, max=2**31 - 1)
+)
+realm_option: Callable[[Any], Any] = click.option("--realm", metavar="NAME", help="Only of this realm.")
+
+one_realm_option: Callable[[Any], Any] = click.option(
+    "--realm", metavar="NAME", help="In this realm instead of the default one."
 )
 yes_option: Callable[[Any], Any] = click.option("--yes", is_flag=True, help="Don't ask.")
 
 
-def sure(question: str, yes: bool) -> None:
-    """Ask before something that can't be undone; the question goes to stderr."""
+def confirm(question: str, yes: bool) -> None:
+    """Ask before a change that cannot be undone. The question goes to stderr."""
     if not yes:
         click.confirm(question, abort=True, err=True)
 
 
 def examples(*lines: str) -> str:
-    """An epilog of examples, not re-wrapped, with what the exit codes mean."""
+    """An epilog with examples, not wrapped, and the meaning of the exit codes."""
     body = "\n".join(f"  {line}" for line in lines)
     return f"\b\nExamples:\n{body}\n\n{EXIT_CODES}"
 
 
 EXIT_CODES = (
-    "Exit codes: 0 done, 1 refused or failed (a sentence on stderr says why), 2 wrong usage, "
-    "3 the relay or the database can't be reached."
+    "Exit codes: 0 done, 1 refused or failed (stderr says why), 2 wrong usage, "
+    "3 the relay or the database cannot be reached."
 )
+
+REFUSED = 1
+UNREACHABLE = 3
+
+
+class Failure(click.ClickException):
+    """Ends a command that was refused or failed."""
+
+    exit_code = REFUSED
+
+    @staticmethod
+    def of(error: SwitchboardError) -> Failure:
+        return Unreachable(str(error)) if isinstance(error, Unavailable) else Failure(str(error))
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        click.echo(f"Error: {escape_unprintable(self.message)}", file=file, err=file is None)
+
+
+class Unreachable(Failure):
+    """Ends a command because the relay or the database cannot be reached."""
+
+    exit_code = UNREACHABLE
+
+
+class CommandEntry(NamedTuple):
+    """The module of a command, its name there, and its line in the help."""
+
+    module: str
+    name: str
+    help: str
+
+
+class LazyGroup(click.Group):
+    """:param entries: commands by name, in the order of the help; entries whose module does not exist are
+    left out"""
+
+    def __init__(self, *args: Any, entries: Mapping[str, CommandEntry], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._entries = {name: entry for name, entry in entries.items() if find_spec(entry.module)}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._entries)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        entry = self._entries.get(cmd_name)
+        if entry is None:
+            return None
+        command = getattr(import_module(entry.module), entry.name)
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, entry.help) for name, entry in self._entries.items()])
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; an error of the product becomes a sentence and an exit code."""
+        try:
+            return super().invoke(ctx)
+        except SwitchboardError as error:
+            raise Failure.of(error) from error
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith(("relay_", "robot_")):
+                raise
+            raise Failure(
+                f"this command needs the server's packages ({error.name} is missing): install the extra 'server'"
+            ) from error

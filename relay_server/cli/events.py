@@ -1,4 +1,4 @@
-"""``switchboard events``."""
+"""``switchboard events`` and ``switchboard audit``."""
 
 from __future__ import annotations
 
@@ -10,19 +10,33 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 
 import click
+import msgspec
 
 from relay_db import queries
 from relay_db.queries import EventCursor, EventSearch, StoredEventRecord
 from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name
-from relay_server.cli.app import App, examples, json_option, pass_app
-from relay_server.cli.names import known_realm, of_one_realm, one_realm_option
-from relay_server.cli.output import moment, say, show, show_json
-from relay_server.events.query import EventFormatter, EventQuery, ask_of, chosen
-from relay_server.events.service import EventVisibility
+from relay_server.cli.app import (
+    App,
+    Failure,
+    examples,
+    existing_realm,
+    json_option,
+    one_realm_option,
+    pass_app,
+    resolve_realm,
+)
+from relay_server.cli.output import format_time, print_json, print_line, print_list, print_result
+from relay_server.events.query import (
+    EventFormatter,
+    EventQuery,
+    EventVisibility,
+    matching_robots,
+    parse_query,
+)
 
 FOLLOW_SECONDS = 0.5
-"""How often it is looked for new ones."""
+"""How often new events are looked for."""
 
 LATEST = 100
 PAGE = 500
@@ -37,18 +51,20 @@ PAGE = 500
     )
 )
 @click.option(
-    "--source", metavar="NAME", help="Only from this source; with * at its end from all that begin so."
+    "--source",
+    metavar="NAME",
+    help="Only events of this source; a * at the end matches all sources that begin so.",
 )
-@click.option("--kind", metavar="NAME", help="Only of this kind, in the same way.")
-@click.option("--robot", metavar="NAME", help="Only about this robot, in the same way.")
-@click.option("--user", metavar="NAME", help="Only what this user did or wrote.")
+@click.option("--kind", metavar="NAME", help="Only events of this kind; * as for --source.")
+@click.option("--robot", metavar="NAME", help="Only events about this robot; * as for --source.")
+@click.option("--user", metavar="NAME", help="Only events that this user caused or wrote.")
 @one_realm_option
-@click.option("--last", metavar="SECONDS", help="Only of the last so many seconds.")
+@click.option("--last", metavar="SECONDS", help="Only events of the last SECONDS.")
 @click.option(
     "--limit", default=LATEST, show_default=True, type=click.IntRange(1, 1_000_000), help="How many."
 )
 @click.option("--csv", "as_csv", is_flag=True, help="Print CSV, the newest first.")
-@click.option("--follow", is_flag=True, help="Go on with what is new, until Ctrl-C.")
+@click.option("--follow", is_flag=True, help="Continue with new events, until Ctrl-C.")
 @json_option
 @pass_app
 def events(
@@ -64,74 +80,81 @@ def events(
     follow: bool,
     as_json: bool,
 ) -> None:
-    """Show what happened of late in a realm, the latest last. With --follow --json an event is a line."""
+    """Show the recent events of a realm, the latest last. With --follow --json each event is one line."""
     if as_csv and (as_json or follow):
-        raise Invalid("--csv goes without --json and --follow")
+        raise Invalid("--csv cannot be combined with --json or --follow")
     named = {what: name for what, name in (("robot", robot), ("user", user)) if name is not None}
-    realm, names = of_one_realm(list(named.values()), realm)
+    realm, names = resolve_realm(list(named.values()), realm)
     options = {"source": source, "kind": kind, "last": last, **dict(zip(named, names, strict=True))}
-    ask = ask_of({name: value for name, value in options.items() if value is not None}, time.time())
+    search = parse_query({name: value for name, value in options.items() if value is not None}, time.time())
     with app.reading() as session:
-        realm = known_realm(session, realm)
-        # Before it is looked: what is written meanwhile is told then, and not passed over.
-        latest = queries.latest_memory(session, realm)
+        realm = existing_realm(session, realm)
+        # Read before the search, so that events which are written meanwhile are followed and not skipped.
+        latest = queries.latest_event_number(session, realm)
         robots = queries.list_robots(session, realm)
-    sight = _sight(realm, {each.id: each.name for each in robots}, ask)
-    forms = EventFormatter({each.id: each.full for each in robots})
-    found = _found(app, sight.ask, limit)
+    visibility = _visibility(realm, {each.id: each.name for each in robots}, search)
+    formatter = EventFormatter({each.id: each.full for each in robots})
+    found = _latest_events(app, visibility.search, limit)
     if as_csv:
         table = csv.writer(sys.stdout)
         table.writerow(EventFormatter.COLUMNS)
-        table.writerows(forms.cells(each) for each in found)
+        table.writerows(formatter.cells(each) for each in found)
         return
     rows = [each for each in found if each.number <= latest][::-1]
     if follow:
-        tell = _json_line if as_json else _line
+        print_event = _json_line if as_json else _line
         with contextlib.suppress(KeyboardInterrupt):
             for each in rows:
-                tell(forms, each)
-            _follow(app, sight, latest, lambda event: tell(forms, event))
+                print_event(formatter, each)
+            _follow(app, visibility, latest, lambda event: print_event(formatter, event))
         return
     columns = ("id", "at", "source", "kind", "robot", "user", "data")
-    show(as_json, (_json(forms, each) for each in rows), columns, (_cells(forms, each) for each in rows))
+    print_list(
+        as_json,
+        (_json(formatter, each) for each in rows),
+        columns,
+        (_cells(formatter, each) for each in rows),
+    )
 
 
-def _sight(realm: str, names: dict[int, str], ask: EventQuery) -> EventVisibility:
-    """Whoever may read the database may see all of it."""
+def _visibility(realm: str, names: dict[int, str], search: EventQuery) -> EventVisibility:
+    """An operator with access to the database may see all events."""
     return EventVisibility(
         EventSearch(
             realm,
-            chosen(ask, names),
-            ask.robot is None,
-            True,
-            ask.source,
-            ask.kind,
-            ask.user,
-            ask.since,
+            matching_robots(search, names),
+            without_robot=search.robot is None,
+            admin=True,
+            source=search.source,
+            kind=search.kind,
+            user=search.user,
+            since=search.since,
         ),
         names,
     )
 
 
-def _found(app: App, ask: EventSearch, limit: int) -> Iterator[StoredEventRecord]:
-    """The newest first, a page at a time."""
+def _latest_events(app: App, search: EventSearch, limit: int) -> Iterator[StoredEventRecord]:
+    """Newest first, one page at a time."""
     place: EventCursor | None = None
     while limit > 0:
         with app.reading() as session:
-            page = queries.recall(session, ask, place, min(limit, PAGE))
+            page = queries.search_events(session, search, place, min(limit, PAGE))
         yield from map(_with_realm, page.events)
-        limit, place = limit - len(page.events), page.place
+        limit, place = limit - len(page.events), page.cursor
         if place is None:
             return
 
 
-def _follow(app: App, sight: EventVisibility, number: int, tell: Callable[[StoredEventRecord], None]) -> None:
+def _follow(
+    app: App, visibility: EventVisibility, number: int, print_event: Callable[[StoredEventRecord], None]
+) -> None:
     while True:
         with app.reading() as session:
-            news = queries.memories_since(session, sight.ask.realm, number, PAGE)
+            news = queries.events_since(session, visibility.search.realm, number, PAGE)
         for each in news:
-            if sight.shows(each):
-                tell(_with_realm(each))
+            if visibility.matches(each):
+                print_event(_with_realm(each))
         number = news[-1].number if news else number
         sys.stdout.flush()
         if len(news) < PAGE:
@@ -139,25 +162,72 @@ def _follow(app: App, sight: EventVisibility, number: int, tell: Callable[[Store
 
 
 def _with_realm(event: StoredEventRecord) -> StoredEventRecord:
-    """With its user's name for the whole relay. Who sits at the relay's machine is no user: he has a space in his."""
+    """The event with its user's full name. An operator of the relay's machine is not a user; their name has a
+    space."""
     if event.user is None or " " in event.user:
         return event
     return event._replace(user=full_name(event.user, event.realm))
 
 
-def _json(forms: EventFormatter, event: StoredEventRecord) -> dict[str, object]:
-    return {**forms.json(event), "data": json.loads(event.data)}
+def _json(formatter: EventFormatter, event: StoredEventRecord) -> dict[str, object]:
+    return {**msgspec.structs.asdict(formatter.info(event)), "data": json.loads(event.data)}
 
 
-def _json_line(forms: EventFormatter, event: StoredEventRecord) -> None:
-    show_json(_json(forms, event))
+def _json_line(formatter: EventFormatter, event: StoredEventRecord) -> None:
+    print_json(_json(formatter, event))
 
 
-def _line(forms: EventFormatter, event: StoredEventRecord) -> None:
-    say("  ".join(each for each in _cells(forms, event)[1:] if each))
+def _line(formatter: EventFormatter, event: StoredEventRecord) -> None:
+    print_line("  ".join(each for each in _cells(formatter, event)[1:] if each))
 
 
-def _cells(forms: EventFormatter, event: StoredEventRecord) -> Sequence[str]:
+def _cells(formatter: EventFormatter, event: StoredEventRecord) -> Sequence[str]:
     data = "" if event.data == "{}" else event.data
-    about = forms.robot(event) or "", event.user or ""
-    return str(event.number), moment(event.at), event.source, event.kind, *about, data
+    about = formatter.robot(event) or "", event.user or ""
+    return str(event.number), format_time(event.at), event.source, event.kind, *about, data
+
+
+@click.group()
+def audit() -> None:
+    """Read and verify the audit log."""
+
+
+@audit.command(
+    "list", epilog=examples("switchboard audit list", "switchboard audit list --limit 1000 --json")
+)
+@click.option("--limit", default=100, show_default=True, type=click.IntRange(1, 1_000_000))
+@json_option
+@pass_app
+def list_(app: App, limit: int, as_json: bool) -> None:
+    """List changes with their user, time and address, the latest last."""
+    with app.reading() as session:
+        entries = queries.list_audit(session, limit)[::-1]
+    cells = (
+        (
+            str(each.id),
+            format_time(each.at),
+            each.actor,
+            each.action,
+            each.target,
+            each.origin,
+            json.dumps(each.data) if each.data else "",
+        )
+        for each in entries
+    )
+    columns = ("id", "at", "actor", "action", "target", "from", "data")
+    print_list(as_json, (each._asdict() for each in entries), columns, cells)
+
+
+@audit.command(epilog=examples("switchboard audit verify && echo whole"))
+@json_option
+@pass_app
+def verify(app: App, as_json: bool) -> None:
+    """Check that no entry was changed, removed or inserted. The exit code is 1 if one was."""
+    with app.reading() as session:
+        broken = queries.verify_audit(session)
+    if broken is None:
+        print_result(as_json, {"whole": True, "first_broken": None}, "The audit log is intact.")
+        return
+    if as_json:
+        print_json({"whole": False, "first_broken": broken})
+    raise Failure(f"the audit log was tampered with: the first broken entry is number {broken}")

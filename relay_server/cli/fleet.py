@@ -1,4 +1,4 @@
-"""``switchboard robot call|publish|set``: one order to many robots; ``switchboard robot group``."""
+"""``switchboard robot call|publish|set|stop|resume``: one order to many robots; ``switchboard robot group``."""
 
 from __future__ import annotations
 
@@ -7,25 +7,38 @@ import math
 import sys
 from collections.abc import Callable
 from typing import Any
+from uuid import uuid4
 
 import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound, Unavailable
-from relay_protocol.realms import DEFAULT_REALM, full_name, parted
-from relay_server.cli.app import App, examples, json_option, pass_app, sure, why_option, yes_option
-from relay_server.cli.control_socket import give_order
-from relay_server.cli.names import listed, new_name, of_one_realm, one_realm_option, realm_option
-from relay_server.cli.output import progress, say, show, show_json, table, tell
+from relay_protocol.realms import DEFAULT_REALM, full_name, split_name
+from relay_server.cli.admin_socket_client import send_fleet_order
+from relay_server.cli.app import (
+    App,
+    confirm,
+    examples,
+    json_option,
+    list_in_realm,
+    new_name,
+    one_realm_option,
+    pass_app,
+    realm_option,
+    resolve_realm,
+    why_option,
+    yes_option,
+)
+from relay_server.cli.output import print_json, print_line, print_list, print_result, print_table, progress
 
-SECONDS = 10.0
-"""What each robot has where nothing else is said. A stop and a resume have their own time."""
+ROBOT_SECONDS = 10.0
+"""Default time for each robot. A stop and a resume have times of their own."""
 
 
 def _number(value: float) -> float:
-    """Click takes NaN for a number within any bounds."""
+    """Click accepts NaN within any bounds."""
     if math.isnan(value):
-        raise click.BadParameter("nan is no number")
+        raise click.BadParameter("nan is not a number")
     return value
 
 
@@ -33,9 +46,9 @@ timeout_option: Callable[[Any], Any] = click.option(
     "--timeout",
     type=click.FloatRange(0.1, 300),
     callback=lambda _context, _option, seconds: _number(seconds),
-    default=SECONDS,
+    default=ROBOT_SECONDS,
     show_default=True,
-    help="Seconds each robot has.",
+    help="Seconds that each robot has.",
 )
 
 
@@ -49,7 +62,7 @@ timeout_option: Callable[[Any], Any] = click.option(
 @click.argument("robots")
 @click.argument("service")
 @click.argument("args", default="{}")
-@click.option("--type", "type_name", default="", help="Of the service, where the robot does not tell.")
+@click.option("--type", "type_name", default="", help="Type of the service, if the robot does not know it.")
 @timeout_option
 @one_realm_option
 @json_option
@@ -66,11 +79,11 @@ def call(
 ) -> None:
     """Call SERVICE with ARGS (JSON) on many robots.
 
-    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
-    A service that moves a robot takes control of it where that is free.
+    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them separated by commas.
+    A service that moves a robot takes control of it, if no client has control.
     """
     order = {"do": "call", "service": service, "args": _json(args, "ARGS"), "type": type_name}
-    _give(app, robots, order, timeout, realm, as_json)
+    run_order(app, robots, order, timeout, realm, as_json)
 
 
 @click.command(
@@ -81,7 +94,7 @@ def call(
 @click.argument("robots")
 @click.argument("topic")
 @click.argument("msg")
-@click.option("--type", "type_name", default="", help="Of the topic, where the robot does not tell.")
+@click.option("--type", "type_name", default="", help="Type of the topic, if the robot does not know it.")
 @timeout_option
 @one_realm_option
 @json_option
@@ -98,11 +111,11 @@ def publish(
 ) -> None:
     """Publish MSG (JSON) once to TOPIC on many robots.
 
-    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
-    Not for topics that move a robot: one message moves none.
+    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them separated by commas.
+    Topics that move a robot are refused, since they need a stream of messages.
     """
     order = {"do": "publish", "topic": topic, "msg": _json(msg, "MSG"), "type": type_name}
-    _give(app, robots, order, timeout, realm, as_json)
+    run_order(app, robots, order, timeout, realm, as_json)
 
 
 @click.command(epilog=examples("switchboard robot set 'cleaner-*' /driver:max_speed 0.5"))
@@ -118,14 +131,14 @@ def set_(
 ) -> None:
     """Set PARAMETER (node:name) to VALUE on many robots.
 
-    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
-    VALUE is JSON; what is none counts as text.
+    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them separated by commas.
+    VALUE is JSON; anything else is taken as text.
     """
     try:
-        meant = json.loads(value)
+        decoded = json.loads(value)
     except ValueError:
-        meant = value
-    _give(app, robots, {"do": "set", "name": parameter, "value": meant}, timeout, realm, as_json)
+        decoded = value
+    run_order(app, robots, {"do": "set", "name": parameter, "value": decoded}, timeout, realm, as_json)
 
 
 @click.command(epilog=examples("switchboard robot stop 'cleaner-*' --why \"wet floor\""))
@@ -135,12 +148,12 @@ def set_(
 @json_option
 @pass_app
 def stop(app: App, robots: str, why: str, realm: str | None, as_json: bool) -> None:
-    """Stop many robots; those that are offline before anything else when they are back.
+    """Stop many robots. Robots that are offline are stopped as soon as they come back.
 
-    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
-    Where no relay runs, 'switchboard stop' keeps the order.
+    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them separated by commas.
+    This needs a running relay; 'switchboard stop' works without one.
     """
-    _give(app, robots, {"do": "stop", "why": why}, SECONDS, realm, as_json)
+    run_order(app, robots, {"do": "stop", "why": why, "stop_id": uuid4().hex}, ROBOT_SECONDS, realm, as_json)
 
 
 @click.command(epilog=examples("switchboard robot resume 'cleaner-*'"))
@@ -150,96 +163,97 @@ def stop(app: App, robots: str, why: str, realm: str | None, as_json: bool) -> N
 @json_option
 @pass_app
 def resume(app: App, robots: str, why: str, realm: str | None, as_json: bool) -> None:
-    """Let many robots that were stopped move again.
+    """Let many stopped robots move again.
 
-    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
+    ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them separated by commas.
     """
-    _give(app, robots, {"do": "resume", "why": why}, SECONDS, realm, as_json)
+    run_order(app, robots, {"do": "resume", "why": why}, ROBOT_SECONDS, realm, as_json)
 
 
 def _json(text: str, what: str) -> Any:
-    """:raises Invalid: it is no JSON"""
     try:
         return json.loads(text)
     except ValueError as error:
-        raise Invalid(f"{what} is no JSON: {error}") from None
+        raise Invalid(f"{what} is not JSON: {error}") from None
 
 
-def _give(
+def run_order(
     app: App, robots: str, order: dict[str, Any], timeout: float, realm: str | None, as_json: bool
 ) -> None:
-    """Give an order, show how it goes, and what came of it; exit code 1 when it failed on any robot.
+    """Give an order and show its progress and results. The exit code is 1 when it failed on any robot.
 
-    :param realm: the one that was named besides the robots
+    :param realm: the option ``--realm``
     """
-    where, asked = of_one_realm([each.strip() for each in robots.split(",") if each.strip()], realm)
+    in_realm, asked = resolve_realm([each.strip() for each in robots.split(",") if each.strip()], realm)
     if not order.get("type", True):
         del order["type"]
-    lines = give_order(app.data, {"robots": asked, "timeout": timeout, **order}, where)
+    lines = send_fleet_order(app.data, {"robots": asked, "timeout": timeout, **order}, in_realm)
     try:
-        done = _Done(next(lines, {}), where)
+        report = _OrderReport(next(lines, {}), in_realm)
     except NotFound as error:
-        if where == DEFAULT_REALM:
+        if in_realm == DEFAULT_REALM:
             raise
-        raise NotFound(f"{error} in the realm '{where}'; see 'switchboard realm list'") from None
-    with progress(len(done.meant), shown=not as_json and sys.stderr.isatty()) as step:
+        raise NotFound(f"{error} in the realm '{in_realm}'; see 'switchboard realm list'") from None
+    with progress(len(report.robots), shown=not as_json and sys.stderr.isatty()) as step:
         try:
             for line in lines:
                 if "robot" in line:
-                    done.results.append({**line, "robot": full_name(str(line["robot"]), where)})
+                    report.results.append({**line, "robot": full_name(str(line["robot"]), in_realm)})
                     step()
         except Unavailable as error:
-            done.broken = str(error)
+            report.interruption = str(error)
     if as_json:
-        told = {"results": done.results, "unmatched": done.unmatched, "whole": done.whole}
-        show_json({**told, "missed": done.missed} if done.missed else told)
+        result = {"results": report.results, "unmatched": report.unmatched, "whole": report.complete}
+        print_json({**result, "missed": report.missed} if report.missed else result)
     else:
-        done.show()
-    if not done.well:
+        report.show()
+    if not report.succeeded:
         sys.exit(1)
 
 
-class _Done:
-    """What came of an order.
+class _OrderReport:
+    """The results of an order.
 
-    :param head: the first line of the relay's answer
-    :param realm: whose robots it was for
+    :param head: first line of the relay's answer
+    :param realm: of the robots
     """
 
     def __init__(self, head: dict[str, Any], realm: str) -> None:
         self._where = "" if realm == DEFAULT_REALM else f" of the realm '{realm}'"
-        self.meant = [str(each) for each in head.get("robots") or ()]
+        self.robots = [str(each) for each in head.get("robots") or ()]
         self.unmatched = [str(each) for each in head.get("unmatched") or ()]
         self.missed = str(head.get("missed") or "")
         self.results: list[dict[str, Any]] = []
-        self.broken = "it has ended the answer"
+        self.interruption = "the answer ended early"
 
     @property
-    def whole(self) -> bool:
-        """Whether every robot is told of."""
-        return len(self.results) == len(self.meant)
+    def complete(self) -> bool:
+        """Whether there is a result for every robot."""
+        return len(self.results) == len(self.robots)
 
     @property
-    def well(self) -> bool:
-        """Whether all that was asked for is done."""
+    def succeeded(self) -> bool:
+        """Whether the order was carried out on every robot that it was meant for."""
         return (
-            self.whole
+            self.complete
             and not (self.unmatched or self.missed)
             and all(each.get("ok") for each in self.results)
         )
 
     def show(self) -> None:
-        """For people."""
+        """Print the results for people."""
         results = sorted(self.results, key=lambda each: str(each.get("robot")))
-        table(("robot", "", "time", "answer"), [_row(each) for each in results])
-        say(f"Done on {sum(bool(each.get('ok')) for each in results)} of {len(self.meant)}.")
-        if not self.whole:
-            left = len(self.meant) - len(results)
-            say(f"Of {left} nothing is known: the relay did not tell to the end ({self.broken}).")
+        print_table(("robot", "", "time", "answer"), [_row(each) for each in results])
+        print_line(f"Done on {sum(bool(each.get('ok')) for each in results)} of {len(self.robots)}.")
+        if not self.complete:
+            left = len(self.robots) - len(results)
+            print_line(
+                f"For {left} robots the result is not known: the relay's answer is incomplete ({self.interruption})."
+            )
         if self.missed:
-            say(f"There may be more robots that are meant: {self.missed}.")
+            print_line(f"The order may be meant for more robots: {self.missed}.")
         for each in self.unmatched:
-            say(f"No robot{self._where} is meant by '{each}'.")
+            print_line(f"'{each}' matches no robot{self._where}.")
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:
@@ -258,7 +272,7 @@ def _row(result: dict[str, Any]) -> tuple[str, ...]:
 
 @click.group()
 def group() -> None:
-    """Put robots into groups, for orders to all of them."""
+    """Put robots into groups, to send orders to all of them."""
 
 
 @group.command(
@@ -272,11 +286,11 @@ def group() -> None:
 @json_option
 @pass_app
 def add(app: App, name: str, robots: tuple[str, ...], as_json: bool) -> None:
-    """Put ROBOTS into group NAME of their realm, which is made when there is none."""
+    """Put ROBOTS into group NAME of their realm. The group is created if there is none."""
     with app.change() as change:
-        meant = [change.robot(each) for each in robots]
-        found = change.fill_robot_group(*new_name(change.session, name), meant)
-    tell(as_json, _told(found), _words(found))
+        chosen = [change.robot(each) for each in robots]
+        found = change.fill_robot_group(*new_name(change.session, name), chosen)
+    print_result(as_json, _group_json(found), _group_text(found))
 
 
 @group.command(
@@ -290,20 +304,22 @@ def add(app: App, name: str, robots: tuple[str, ...], as_json: bool) -> None:
 @json_option
 @pass_app
 def remove(app: App, name: str, robots: tuple[str, ...], yes: bool, as_json: bool) -> None:
-    """Take ROBOTS out of group NAME; without any, remove the group. Its robots stay."""
+    """Take ROBOTS out of group NAME. Without ROBOTS, remove the group; its robots stay."""
     if not robots:
         with app.reading() as session:
-            sure(f"Remove group of robots {_group(session, name).full}?", yes)
+            confirm(f"Remove group of robots {_group(session, name).full}?", yes)
     with app.change() as change:
         found = _group(change.session, name)
-        meant = [change.robot(each) for each in robots]
-        left = change.empty_robot_group(found, meant) if robots else None
+        chosen = [change.robot(each) for each in robots]
+        left = change.empty_robot_group(found, chosen) if robots else None
         if left is None:
             change.remove_robot_group(found)
     if left is None:
-        tell(as_json, {"group": found.full, "removed": True}, f"Removed group of robots {found.full}.")
+        print_result(
+            as_json, {"group": found.full, "removed": True}, f"Removed group of robots {found.full}."
+        )
     else:
-        tell(as_json, _told(left), _words(left))
+        print_result(as_json, _group_json(left), _group_text(left))
 
 
 @group.command(
@@ -313,26 +329,25 @@ def remove(app: App, name: str, robots: tuple[str, ...], yes: bool, as_json: boo
 @json_option
 @pass_app
 def list_(app: App, realm: str | None, as_json: bool) -> None:
-    """List all groups of robots, or those of one realm, and what is in them."""
+    """List all groups of robots and their robots, or those of one realm."""
     with app.reading() as session:
-        groups = listed(session, queries.list_robot_groups, realm)
+        groups = list_in_realm(session, queries.list_robot_groups, realm)
     cells = ((each.full, ", ".join(_robots(each))) for each in groups)
-    show(as_json, map(_told, groups), ("group", "robots"), cells)
+    print_list(as_json, map(_group_json, groups), ("group", "robots"), cells)
 
 
 def _group(session: Any, name: str) -> queries.RobotGroupRecord:
-    """:raises NotFound: no such group"""
-    found = queries.find_robot_group(session, *parted(name))
+    found = queries.find_robot_group(session, *split_name(name))
     if found is None:
         raise NotFound(f"there is no group of robots '{name}'; see 'switchboard robot group list'")
     return found
 
 
-def _told(record: queries.RobotGroupRecord) -> dict[str, Any]:
+def _group_json(record: queries.RobotGroupRecord) -> dict[str, Any]:
     return {"group": record.full, "robots": _robots(record)}
 
 
-def _words(record: queries.RobotGroupRecord) -> str:
+def _group_text(record: queries.RobotGroupRecord) -> str:
     return f"Group {record.full}: {', '.join(_robots(record)) or 'no robots'}."
 
 

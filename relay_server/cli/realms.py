@@ -8,16 +8,16 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid
-from relay_server.cli.app import App, examples, json_option, pass_app, sure, yes_option
-from relay_server.cli.names import known_realm
-from relay_server.cli.output import show, tell
+from relay_server.cli.app import App, confirm, examples, existing_realm, json_option, pass_app, yes_option
+from relay_server.cli.output import print_list, print_result
 
 
 @click.group()
 def realm() -> None:
     """Keep users and robots of one relay apart: names are unique within one realm.
 
-    The whole relay knows somebody of the realm lab1 as toad@lab1. A name without @ is of the realm default.
+    Outside its realm the user toad of lab1 is called toad@lab1. A name without @ belongs to the realm
+    'default'.
     """
 
 
@@ -26,18 +26,18 @@ def realm() -> None:
 @json_option
 @pass_app
 def add(app: App, name: str, as_json: bool) -> None:
-    """Add a realm NAME."""
+    """Add the realm NAME."""
     with app.change() as change:
         added = queries.add_realm(change.session, name)
         change.audit("realm.add", added.name)
-    tell(as_json, {"realm": added.name}, f"Added realm {added.name}.")
+    print_result(as_json, {"realm": added.name}, f"Added realm {added.name}.")
 
 
 @realm.command("list", epilog=examples("switchboard realm list", "switchboard realm list --json"))
 @json_option
 @pass_app
 def list_(app: App, as_json: bool) -> None:
-    """List all realms, and how many users and robots are in them."""
+    """List all realms with the numbers of their users and robots."""
     with app.reading() as session:
         realms = queries.list_realms(session)
         users = Counter(each.realm for each in queries.list_users(session))
@@ -54,9 +54,10 @@ def list_(app: App, as_json: bool) -> None:
         for each in realms
     )
     cells = (
-        (each.name, str(users[each.name]), str(robots[each.name]), _kept(each.events_days)) for each in realms
+        (each.name, str(users[each.name]), str(robots[each.name]), _retention(each.events_days))
+        for each in realms
     )
-    show(as_json, rows, ("realm", "users", "robots", "events kept"), cells)
+    print_list(as_json, rows, ("realm", "users", "robots", "events stored"), cells)
 
 
 @realm.command(
@@ -70,29 +71,28 @@ def list_(app: App, as_json: bool) -> None:
     "--events-days",
     required=True,
     metavar="DAYS",
-    help="How long its memory keeps events; 'relay': as long as 'serve --events-days' says.",
+    help="Days for which the realm's events are stored; 'relay' for the value of 'serve --events-days'.",
 )
 @json_option
 @pass_app
 def set_(app: App, name: str, events_days: str, as_json: bool) -> None:
-    """Say how long the memory of realm NAME keeps events. A running relay goes by it within ten minutes."""
+    """Set how long events of realm NAME are stored. A running relay follows within ten minutes."""
     days = None if events_days == "relay" else _days(events_days)
     with app.change() as change:
-        name = known_realm(change.session, name)
+        name = existing_realm(change.session, name)
         change.keep_events(name, days)
-    told = {"realm": name, "events_days": days}
-    tell(as_json, told, f"The memory of realm {name} keeps events {_kept(days)}.")
+    result = {"realm": name, "events_days": days}
+    print_result(as_json, result, f"Events of realm {name} are stored {_retention(days)}.")
 
 
 def _days(text: str) -> float:
-    """:raises Invalid: it is no number"""
     try:
         return float(text)
     except ValueError:
         raise Invalid("--events-days is a number of days, or 'relay'") from None
 
 
-def _kept(days: float | None) -> str:
+def _retention(days: float | None) -> str:
     return "as long as the relay's" if days is None else f"for {days:g} days"
 
 
@@ -102,11 +102,11 @@ def _kept(days: float | None) -> str:
 @json_option
 @pass_app
 def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
-    """Remove realm NAME with its events and its directory, once nobody and no robot is in it any more."""
+    """Remove realm NAME with its events and its directory. It must have no users and no robots."""
     with app.reading() as session:
-        name = known_realm(session, name)
-    sure(f"Remove realm {name} with its events and its directory?", yes)
+        name = existing_realm(session, name)
+    confirm(f"Remove realm {name} with its events and its directory?", yes)
     with app.change() as change:
         queries.remove_realm(change.session, name)
         change.audit("realm.remove", name)
-    tell(as_json, {"realm": name, "removed": True}, f"Removed realm {name}.")
+    print_result(as_json, {"realm": name, "removed": True}, f"Removed realm {name}.")

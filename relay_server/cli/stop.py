@@ -1,4 +1,4 @@
-"""``switchboard stop`` and ``switchboard resume``: through the relay where one runs, else for when it does."""
+"""``switchboard stop`` and ``switchboard resume``: through the relay, or in the database when none runs."""
 
 from __future__ import annotations
 
@@ -6,50 +6,60 @@ import sys
 import time
 from collections.abc import Collection
 from typing import Any
+from uuid import uuid4
 
 import click
 
 from relay_db import queries
 from relay_db.names import full_name_of
 from relay_protocol.errors import SwitchboardError, Unavailable
-from relay_server.cli.app import App, examples, json_option, os_user, pass_app, why_option
-from relay_server.cli.control_socket import NoRelay, order_motion
-from relay_server.cli.failure import REFUSED, UNREACHABLE
-from relay_server.cli.output import say_aside, show_json, tell
+from relay_protocol.limits import REASON_LENGTH
+from relay_server.cli.admin_socket_client import NoRelay, send_order
+from relay_server.cli.app import (
+    REFUSED,
+    UNREACHABLE,
+    App,
+    examples,
+    json_option,
+    os_user,
+    pass_app,
+    why_option,
+)
+from relay_server.cli.output import print_json, print_note, print_result
 
 
 @click.command(
     epilog=examples(
         "switchboard stop rover",
         "switchboard stop mobile@lab2",
-        'switchboard stop rover --why "somebody is under it"',
+        'switchboard stop rover --why "a person is under it"',
         "switchboard stop --all",
     )
 )
 @click.argument("robot", required=False)
-@click.option("--all", "everything", is_flag=True, help="Every robot of this relay, of all realms.")
+@click.option("--all", "all_robots", is_flag=True, help="Every robot of this relay, in all realms.")
 @why_option
 @json_option
 @pass_app
-def stop(app: App, robot: str | None, everything: bool, why: str, as_json: bool) -> None:
-    """Stop ROBOT, and keep it stopped until somebody resumes it.
+def stop(app: App, robot: str | None, all_robots: bool, why: str, as_json: bool) -> None:
+    """Stop ROBOT. It stays stopped until it is resumed.
 
-    A robot that is offline is stopped before anything else when it comes back, also when no relay runs now. An order
-    that the relay does not confirm within some seconds is kept in the same way.
+    A robot that is offline is stopped as soon as it comes back, even if no relay runs now. The same holds for an order
+    that the relay does not confirm within some seconds.
     """
-    if (robot is None) is not everything:
-        raise click.UsageError("name a robot, or say --all")
-    told, unanswered = _StopOrder(app, None if robot is None else full_name_of(robot), why).give()
+    if (robot is None) is not all_robots:
+        raise click.UsageError("name a robot, or give --all")
+    result, unanswered = _StopOrder(app, None if robot is None else full_name_of(robot), why).send()
     if as_json:
-        show_json({"robots": told})
+        print_json({"robots": result})
     else:
-        for each in told:
-            tell(False, each, _words(each))
-        if not told:
-            tell(False, told, "There is no robot.")
+        for each in result:
+            print_result(False, each, _outcome_text(each))
+        if not result:
+            print_result(False, result, "There are no robots.")
     if unanswered:
         sys.exit(UNREACHABLE)
-    if any("reason" in each for each in told):
+    if any("reason" in each for each in result):
         sys.exit(REFUSED)
 
 
@@ -59,20 +69,20 @@ def stop(app: App, robot: str | None, everything: bool, why: str, as_json: bool)
 @json_option
 @pass_app
 def resume(app: App, robot: str, why: str, as_json: bool) -> None:
-    """Let ROBOT move again. It stands until somebody commands it.
+    """Let ROBOT move again. It stays still until it gets a command.
 
-    A stop that a robot was not told of is taken back. One that it has confirmed it keeps, so it must be online.
+    A stop that the robot has not received is cancelled. A robot that has confirmed its stop must be online.
     """
     robot = full_name_of(robot)
     try:
-        order_motion(app.data, "resume", {"robot": robot, "why": why, "by": os_user()})
+        send_order(app.data, "resume", {"robot": robot, "why": why, "by": os_user()})
     except NoRelay:
-        _take_back(app, robot, why)
-    tell(as_json, {"robot": robot, "resumed": True}, f"Robot {robot} may move again.")
+        _cancel_stop(app, robot, why)
+    print_result(as_json, {"robot": robot, "resumed": True}, f"Robot {robot} may move again.")
 
 
 class _StopOrder:
-    """One order to stop: given to the relay, and kept in the database where that does not confirm it.
+    """One order to stop, sent to the relay and stored in the database when the relay does not confirm it.
 
     :param robot: its name, as ``mobile@lab2``; ``None`` for all
     """
@@ -80,83 +90,91 @@ class _StopOrder:
     def __init__(self, app: App, robot: str | None, why: str) -> None:
         self._app = app
         self._robot = robot
-        self._why = why
-        self._kept: list[dict[str, Any]] = []
+        self._why = why[:REASON_LENGTH]
+        self._stop_id = uuid4().hex
+        self._stored: list[dict[str, Any]] = []
 
-    def give(self) -> tuple[list[dict[str, Any]], bool]:
-        """What became of it on each robot, and whether somebody who should have answered did not.
+    def send(self) -> tuple[list[dict[str, Any]], bool]:
+        """The outcome for each robot, and whether the relay failed to confirm.
 
-        :raises SwitchboardError: it could be neither given nor kept
+        :raises SwitchboardError: the order could neither be sent nor stored
         """
-        order = {"robot": self._robot, "why": self._why, "by": os_user()}
+        order = {"robot": self._robot, "why": self._why, "by": os_user(), "stop_id": self._stop_id}
         try:
-            answer = order_motion(self._app.data, "stop", order, self._unsure)
+            answer = send_order(self._app.data, "stop", order, self._store_meanwhile)
         except NoRelay:
-            return self._keep(), False
+            return self._store(), False
         except Unavailable as error:
             return self._unconfirmed(error), True
-        told = [each for each in answer.get("robots") or () if isinstance(each, dict)]
+        result = [each for each in answer.get("robots") or () if isinstance(each, dict)]
         missed = answer.get("missed")
         if not missed:
-            return told, False
-        say_aside(f"Not all robots are told yet: {missed}. Their orders are kept now.")
-        return told + self._keep({str(each.get("robot")) for each in told}), False
+            return result, False
+        print_note(f"Not all robots have the order yet: {missed}. Their orders are stored now.")
+        return result + self._store({str(each.get("robot")) for each in result}), False
 
-    def _unsure(self, seconds: float) -> None:
-        """The relay has not answered for so long."""
+    def _store_meanwhile(self, seconds: float) -> None:
         try:
-            self._kept = self._keep()
+            self._stored = self._store()
         except Unavailable as error:
-            say_aside(f"The relay has not answered for {seconds:g} s, and the order can't be kept: {error}")
+            print_note(
+                f"The relay has not answered for {seconds:g} s, and the order cannot be stored: {error}"
+            )
         else:
-            say_aside(
-                f"The relay has not answered for {seconds:g} s. The order is kept until it is confirmed."
+            print_note(
+                f"The relay has not answered for {seconds:g} s. The order is stored until it is confirmed."
             )
 
     def _unconfirmed(self, error: Unavailable) -> list[dict[str, Any]]:
         try:
-            kept = self._kept or self._keep()
+            stored = self._stored or self._store()
         except SwitchboardError:
             raise error from None
-        reason = f"not confirmed: {error}. The order is kept, and told by the next relay that runs"
-        return [{**each, "reason": reason} for each in kept]
+        reason = f"not confirmed: {error}. The order is stored; the next relay that runs sends it"
+        return [{**each, "reason": reason} for each in stored]
 
-    def _keep(self, told: Collection[str] = ()) -> list[dict[str, Any]]:
-        """Robots are told by the next relay that runs, or by one on another machine at once.
+    def _store(self, result: Collection[str] = ()) -> list[dict[str, Any]]:
+        """Store the order for the next relay that runs, or for one on another machine, which sends it at
+        once.
 
-        :param told: names of those that need not be
+        :param result: names of robots that need no order
         """
-        kept = []
+        stored = []
         with self._app.change() as change:
             robots = (
                 queries.list_robots(change.session) if self._robot is None else [change.robot(self._robot)]
             )
             for each in robots:
-                if each.full not in told:
-                    queries.order_stop(change.session, each.id, os_user(), self._why, time.time(), tell=True)
-                    change.audit("robot.stopped", each.full, why=self._why)
-                    kept.append({"robot": each.full, "done": False})
-        return kept
+                if each.full not in result:
+                    new = queries.order_stop_once(
+                        change.session, each.id, os_user(), self._why, time.time(), self._stop_id
+                    )
+                    if new:
+                        change.audit("robot.stopped", each.full, why=self._why)
+                    stored.append({"robot": each.full, "done": False})
+        return stored
 
 
-def _take_back(app: App, robot: str, why: str) -> None:
+def _cancel_stop(app: App, robot: str, why: str) -> None:
     """:raises NotFound: no such robot
-    :raises Unavailable: there is nothing that could be taken back without a relay
+    :raises Unavailable: without a relay there is nothing to cancel
     """
     with app.change() as change:
         found = change.robot(robot)
-        if not queries.stop_told(change.session, found.id):
+        if not queries.remove_stop(change.session, found.id):
             raise Unavailable(
-                "no relay runs on this data folder, and no stop of this robot waits to be told; "
-                "what the robot has confirmed can be resumed only while it is online"
+                "no relay runs on this data folder, and no stop of this robot is waiting to be sent; "
+                "a stop that the robot has confirmed can be resumed only while it is online"
             )
         change.audit("robot.resumed", found.full, why=why)
 
 
-def _words(told: dict[str, Any]) -> str:
-    robot = str(told.get("robot", "?"))
-    if told.get("done"):
+def _outcome_text(result: dict[str, Any]) -> str:
+    robot = str(result.get("robot", "?"))
+    if result.get("done"):
         return f"Robot {robot} is stopped."
-    if "reason" in told:
-        return f"Robot {robot}: {told['reason']}"
-    return f"Robot {robot} can't be reached now; it will be stopped before anything else when it is back."
+    if "reason" in result:
+        # The reason of a stop that was done in part is a sentence about the robot.
+        reason = str(result["reason"])
+        return f"{reason[:1].upper()}{reason[1:]}" if result.get("stopped") else f"Robot {robot}: {reason}"
+    return f"Robot {robot} cannot be reached now; it will be stopped as soon as it comes back."

@@ -1,18 +1,16 @@
-"""Work that is finished whoever stops waiting for it: who asked may hang up, what was ordered may not be forgotten."""
+"""Monotonic time and timers, injected everywhere so that tests can move the clock."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
-from typing import Any, Protocol, TypeVar, cast
+import heapq
+import itertools
+from collections.abc import Callable
+from typing import Any, Protocol, cast
 
-from twisted.internet.defer import CancelledError, Deferred
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import LoopingCall
-from twisted.python.failure import Failure
-
-from relay_protocol.errors import Unavailable
-
-T = TypeVar("T")
+from twisted.logger import Logger
 
 
 class Timer(Protocol):
@@ -42,19 +40,19 @@ def cancel(timer: Timer | None) -> None:
 
 
 def as_twisted(clock: Clock) -> IReactorTime:
-    """The clock where Twisted's types want a whole ``IReactorTime``; it uses no more of one than ours has."""
+    """The clock typed as ``IReactorTime``, for Twisted functions that use only the methods of :class:`Clock`."""
     return cast(IReactorTime, clock)
 
 
 def looping(clock: Clock, call: Callable[[], object]) -> LoopingCall:
-    """A call to be repeated on this clock."""
+    """A ``LoopingCall`` on this clock."""
     loop = LoopingCall(call)
     loop.clock = as_twisted(clock)
     return loop
 
 
 async def sleep(clock: Clock, seconds: float) -> None:
-    """Wait so long; who gives up waiting leaves no timer."""
+    """Wait. Cancelling it cancels the timer."""
     done: Deferred[None] = Deferred()
     timer = clock.callLater(seconds, done.callback, None)
     try:
@@ -63,74 +61,78 @@ async def sleep(clock: Clock, seconds: float) -> None:
         cancel(timer)
 
 
-async def with_timeout(
-    clock: Clock, seconds: float, work: Coroutine[Deferred[Any], Any, T] | Deferred[T], words: str
-) -> T:
-    """Do something that must not be waited for long; what is not done by then is given up.
+SLACK = 0.002
+"""Calls due within this many seconds are made together: fewer timers, and rounding can't delay a call."""
 
-    :raises Unavailable: it is given up, in these words
+
+class PeriodicTimer:
+    """A repeated call.
+
+    :param interval: seconds; a change takes effect after the next call
     """
 
-    def late(result: Any, _: float) -> Any:
-        if isinstance(result, Failure) and result.check(CancelledError):
-            raise Unavailable(words)
-        return result
+    __slots__ = ("call", "interval", "stopped")
 
-    running = work if isinstance(work, Deferred) else Deferred.fromCoroutine(work)
-    running.addTimeout(seconds, as_twisted(clock), late)
-    return await running
+    def __init__(self, call: Callable[[], object], interval: float) -> None:
+        self.call = call
+        self.interval = interval
+        self.stopped = False
 
-
-class SingleFlight:
-    """Work that many ask for: it is never under way twice, and all who ask while it is share the next time.
-
-    :param work: what is done; were it to ask itself, it would wait for ever
-    """
-
-    def __init__(self, work: Callable[[], Coroutine[Deferred[Any], Any, None]]) -> None:
-        self._work = work
-        self._under_way = False
-        self._asked: list[Deferred[None]] = []
-
-    async def ask(self) -> None:
-        """Have it done once more, from now on; it goes on when who waits gives up. Raises what the work raises."""
-        waiting: Deferred[None] = Deferred()
-        self._asked.append(waiting)
-        if not self._under_way:
-            self._begin()
-        await waiting
-
-    def _begin(self) -> None:
-        asked, self._asked = self._asked, []
-        self._under_way = True
-        Deferred.fromCoroutine(self._work()).addBoth(self._done, asked)
-
-    def _done(self, result: Failure | None, asked: list[Deferred[None]]) -> Failure | None:
-        self._under_way = False
-        if self._asked:
-            self._begin()
-        left = [each for each in asked if not each.called]
-        for each in left:
-            each.callback(result)
-        # An error that nobody waits for any more is left to Twisted, which logs it.
-        return None if left else result
+    def stop(self) -> None:
+        """Stop the calls."""
+        self.stopped = True
+        self.call = _nothing
 
 
-def shield(work: Deferred[T]) -> Deferred[T]:
-    """What is waited for in place of work that goes on when who waits gives up."""
-    waiting: Deferred[T] = Deferred()
-
-    def done(result: Any) -> Any:
-        # An error that nobody waits for any more is left to Twisted, which logs it.
-        return result if waiting.called else waiting.callback(result)
-
-    work.addBoth(done)
-    return waiting
+def _nothing() -> None:
+    """Releases what the call refers to before the queue does."""
 
 
-def detached(work: Coroutine[Deferred[Any], Any, T]) -> Deferred[T]:
-    """Start a piece of work; what comes back fires with its result, and may be cancelled without ending it."""
-    waiting: Deferred[T] = Deferred()
-    # A Deferred that was cancelled passes over the one result that still comes.
-    Deferred.fromCoroutine(work).addCallbacks(waiting.callback, waiting.errback)
-    return waiting
+class PeriodicTimers:
+    """Runs many periodic calls with one timer. Calls that were missed while the clock stood still are skipped."""
+
+    log = Logger()
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._due: list[tuple[float, int, PeriodicTimer]] = []
+        self._serial = itertools.count()
+        self._timer: Timer | None = None
+        self._timer_at = 0.0
+
+    def start(self, timer: PeriodicTimer) -> None:
+        """Call now, and then every ``interval`` seconds."""
+        now = self._clock.seconds()
+        heapq.heappush(self._due, (now + timer.interval, next(self._serial), timer))
+        self._schedule(self._due[0][0], now)
+        self._call(timer)
+
+    def _schedule(self, moment: float, now: float) -> None:
+        if self._timer is not None and self._timer_at <= moment:
+            return
+        cancel(self._timer)
+        self._timer_at = moment
+        self._timer = self._clock.callLater(max(0.0, moment - now), self._run)
+
+    def _run(self) -> None:
+        self._timer = None
+        due, now = self._due, self._clock.seconds()
+        while due and due[0][0] <= now + SLACK:
+            at, serial, each = due[0]
+            if each.stopped:
+                heapq.heappop(due)
+                continue
+            following = at + each.interval
+            if following <= now:
+                following = now + each.interval
+            heapq.heapreplace(due, (following, serial, each))
+            self._call(each)
+        if due:
+            self._schedule(due[0][0], self._clock.seconds())
+
+    def _call(self, each: PeriodicTimer) -> None:
+        try:
+            each.call()
+        except Exception:
+            # A failure for one client must not stop the calls of others.
+            self.log.failure("a periodic call failed")

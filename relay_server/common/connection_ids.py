@@ -1,6 +1,6 @@
-"""Numbers of clients, by which robots and people tell them apart; and names of what robots join.
+"""Connection ids of clients, and names of channels and streams.
 
-They are drawn, not counted: who sees his own one after the other must not learn how many others come to the relay.
+They are random, not counted: a user who sees their own ids must not learn how many others connect.
 """
 
 from __future__ import annotations
@@ -11,14 +11,16 @@ from collections.abc import Callable, Iterable
 
 MOST = 1 << 31
 KEPT = 1 << 16
-"""Numbers given last that are not given again: more than there are clients at a time, and what robots remember."""
+"""Number of latest ids that are not used again: more than clients at a time, and more than robots remember."""
 
 
-def name_of(stem: str, taken: Iterable[str], draw: Callable[[], str] = lambda: secrets.token_hex(4)) -> str:
-    """A name that none of those that are taken is.
+def unused_name(
+    stem: str, taken: Iterable[str], draw: Callable[[], str] = lambda: secrets.token_hex(4)
+) -> str:
+    """A name that is not taken.
 
-    :param stem: what it begins with
-    :param draw: an unguessable text
+    :param stem: the beginning of the name
+    :param draw: returns an unguessable text
     """
     others = set(taken)
     name = f"{stem}{draw()}"
@@ -32,9 +34,9 @@ def _drawn() -> int:
 
 
 class ConnectionIds:
-    """Gives each client a number that no other has or had a while ago.
+    """Gives each client an id that no other client has or had recently.
 
-    :param draw: an unguessable number from 1 to :data:`MOST`
+    :param draw: returns an unguessable number from 1 to :data:`MOST`
     """
 
     def __init__(self, draw: Callable[[], int] = _drawn) -> None:
@@ -42,7 +44,7 @@ class ConnectionIds:
         self._given: OrderedDict[int, None] = OrderedDict()
 
     def take(self) -> int:
-        """The next one."""
+        """A new id."""
         number = self._draw()
         while number in self._given:
             number = self._draw()

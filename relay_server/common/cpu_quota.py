@@ -1,7 +1,7 @@
-"""Shares of the relay's processor, so that no user can take it from the others by asking for much.
+"""CPU quotas, so that one user's requests can't starve the others.
 
-What is costly is timed while it is done, and the time is taken from a share that fills again as time goes by. Counted
-by user, not by connection: many connections are no way around it.
+Costly work is timed, and the time is taken from a quota that refills at a constant rate. Quotas count per user, not per
+connection, so opening many connections does not help.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from contextlib import contextmanager
 
 REQUESTS = 0.25
 REQUESTS_RESERVE = 1.0
-"""Of a second, what one user's requests may take each second, and what may be saved up: connecting asks for much."""
+"""CPU seconds per second for one user's requests, and most CPU seconds saved up, as connecting costs much."""
 
 DEBT = 5.0
-"""Seconds of the processor one user may be over that. Then whoever asks for more is cut."""
+"""Most CPU seconds by which a user may overdraw the quota of requests. Beyond it their connections are closed."""
 
-FORMS = 0.25
-FORMS_OF_USER = 0.1
-FORMS_RESERVE = 0.05
-"""The same for the costly forms of messages (SPEC section 1.6): of all together, of one user, and what may be saved."""
+ENCODINGS = 0.25
+ENCODINGS_OF_USER = 0.1
+ENCODINGS_RESERVE = 0.05
+"""CPU seconds per second for costly encodings (SPEC 1.6) of all users and of one; most seconds saved up."""
 
 
-class Quota:
-    """A share of time. What is done last may overdraw it: nobody knows before what it will take.
+class CpuQuota:
+    """CPU time that refills. The last work may overdraw it, because its cost is known only afterwards.
 
-    :param share: seconds of work each second
-    :param reserve: seconds of work that can be saved up
+    :param share: CPU seconds per second
+    :param reserve: most CPU seconds saved up
     :param seconds: a monotonic clock
     """
 
@@ -41,66 +41,69 @@ class Quota:
 
     @property
     def left(self) -> float:
-        """Seconds of work that may be done now; negative when it is overdrawn."""
+        """CPU seconds left; negative when overdrawn."""
         now = self._seconds()
         self._left = min(self._reserve, self._left + max(0.0, now - self._at) * self._share)
         self._at = now
         return self._left
 
     def spend(self, work: float) -> None:
-        """So many seconds of work were done."""
+        """Subtract CPU seconds."""
         self._left = self.left - work
 
 
 class UserQuota:
-    """What one user may have of the processor, over all of his connections.
+    """The CPU quotas of one user, over all of their connections.
 
-    :param everyone: for costly forms, of all users
+    :param everyone: quota of all users for costly encodings
     :param seconds: a monotonic clock
-    :param worked: seconds of processor time so far
+    :param worked: CPU seconds used so far
     """
 
-    __slots__ = ("__weakref__", "_everyone", "_forms", "requests", "worked")
+    __slots__ = ("__weakref__", "_encodings", "_everyone", "requests", "worked")
 
-    def __init__(self, everyone: Quota, seconds: Callable[[], float], worked: Callable[[], float]) -> None:
+    def __init__(self, everyone: CpuQuota, seconds: Callable[[], float], worked: Callable[[], float]) -> None:
         self.worked = worked
-        self.requests = Quota(REQUESTS, REQUESTS_RESERVE, seconds)
-        self._forms = Quota(FORMS_OF_USER, FORMS_RESERVE, seconds)
+        self.requests = CpuQuota(REQUESTS, REQUESTS_RESERVE, seconds)
+        self._encodings = CpuQuota(ENCODINGS_OF_USER, ENCODINGS_RESERVE, seconds)
         self._everyone = everyone
 
     @property
-    def may_form(self) -> bool:
-        """Whether a message may be put in a costly form now."""
-        return self._forms.left > 0 and self._everyone.left > 0
+    def may_encode(self) -> bool:
+        """Whether a costly encoding may be made now."""
+        return self._encodings.left > 0 and self._everyone.left > 0
 
     @contextmanager
-    def forming(self) -> Iterator[None]:
-        """Around the work of putting a message in a costly form."""
+    def encoding(self) -> Iterator[None]:
+        """Time the making of a costly encoding."""
         began = self.worked()
         try:
             yield
         finally:
             work = self.worked() - began
-            self._forms.spend(work)
+            self._encodings.spend(work)
             self._everyone.spend(work)
 
 
 class UserQuotas:
-    """The allowances of all users. Each is kept for good: one who comes back has what he has left.
+    """The quotas of all users. They are kept, so a user who reconnects has what is left.
 
     :param seconds: a monotonic clock
-    :param worked: seconds of processor time so far
+    :param worked: CPU seconds used so far
     """
 
     def __init__(self, seconds: Callable[[], float], worked: Callable[[], float]) -> None:
         self._seconds = seconds
         self._worked = worked
-        self._forms = Quota(FORMS, FORMS_RESERVE, seconds)
+        self._encodings = CpuQuota(ENCODINGS, ENCODINGS_RESERVE, seconds)
         self._of: dict[int, UserQuota] = {}
 
     def of(self, user: int) -> UserQuota:
-        """The allowance of a user, by id."""
+        """The quotas of a user.
+
+        :param user: the user's id
+        """
         found = self._of.get(user)
         if found is None:
-            found = self._of[user] = UserQuota(self._forms, self._seconds, self._worked)
+            found = self._of[user] = UserQuota(self._encodings, self._seconds, self._worked)
         return found

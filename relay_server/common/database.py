@@ -1,6 +1,6 @@
-"""The database, asked from the reactor: named queries run in bounded thread pools.
+"""Database access from the reactor: named queries run in bounded thread pools.
 
-One pool reads, one writes; SQLite gets one writer, so writes queue here and not on the file's lock.
+One pool reads, one writes. SQLite gets one writer, so writes queue here and not on the lock of the file.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ T = TypeVar("T")
 
 READERS = 2
 WAITING = 256
-"""Reads, and writes, at a time. More queue up only when the database hangs; further ones are refused."""
+"""Most reads, and most writes, that run or wait. So many wait only if the database hangs; further ones are refused."""
 
 
 class BoundedThreadPool:
     """A pool of threads with a bounded queue in front.
 
     :param reactor: calls results back
-    :param most: pieces of work that may be under way or wait, also those whose asker has left
-    :param overload: what further askers are told
-    :param only_reads: the work changes nothing; what has not begun when its asker leaves is left out
+    :param most: most jobs that run or wait, including those whose caller has left
+    :param overload: error text for further callers
+    :param only_reads: whether the work changes nothing; a job whose caller leaves before it begins is skipped
     """
 
     def __init__(
@@ -57,23 +57,23 @@ class BoundedThreadPool:
         self._pool.start()
 
     def stop(self) -> None:
-        """Finish what is under way; blocks for as long as that takes."""
+        """Finish all jobs; blocks for as long as that takes."""
         self._pool.stop()
 
     async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Do this in a thread. It is done also when its asker leaves (``only_reads`` apart).
+        """Do work in a thread. It is done even if its caller leaves, except with ``only_reads``.
 
-        :raises Unavailable: too much waits already
+        :raises Unavailable: too many jobs wait
         """
         if self._under_way >= self._most:
             raise Unavailable(self._overload)
         self._under_way += 1
-        # Not the thread's own Deferred: cancelling that would free the place while the work goes on.
+        # Not the thread's own Deferred: cancelling it would free the slot while the work goes on.
         waiting: Deferred[T] = Deferred()
 
         def begin() -> T:
             if self._only_reads and waiting.called:
-                # Nobody waits for it any more: the threads are for others when the database is back.
+                # Its caller has left; skipping it leaves the threads to others when the database is back.
                 raise CancelledError
             return work(*args, **kwargs)
 
@@ -102,12 +102,12 @@ class AsyncDatabase:
         self._writers = BoundedThreadPool(reactor, "db-write", database.writers, WAITING, overload)
 
     def start(self) -> None:
-        """Start the pools. The database must be upgraded already."""
+        """Start the pools. The database must have been upgraded before."""
         self._readers.start()
         self._writers.start()
 
     def stop(self) -> None:
-        """Finish what is under way and close the database; blocks for as long as that takes."""
+        """Finish all queries and close the database; blocks for as long as that takes."""
         self._readers.stop()
         self._writers.stop()
         self.database.close()
@@ -115,7 +115,7 @@ class AsyncDatabase:
     async def read(self, query: Callable[Concatenate[Session, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run a query that changes nothing.
 
-        :raises Unavailable: the database can't be reached, or too many asks wait for it
+        :raises Unavailable: the database does not answer, or too many queries wait
         """
 
         def work() -> T:
@@ -129,7 +129,7 @@ class AsyncDatabase:
     ) -> T:
         """Run a query in a transaction of its own; it has been committed when this returns.
 
-        It is done also when its asker has left: somebody logged out, removed or revoked something.
+        It runs even if its caller has left, as it may be a logout, a removal or a revocation.
 
         :raises Unavailable: as :meth:`read`
         """

@@ -1,8 +1,8 @@
-"""When a request can't have been sent before: it gives back the moment that an earlier answer named.
+"""Freshness tokens: proof that a request was sent after an answer of this relay (SPEC 1.13).
 
-Requests carry no sending time one could trust, and a connection says nothing where a proxy keeps it open. But whoever
-gives back a moment has sent his request after he had read it (as with pings, see
-:mod:`relay_server.sessions.message_age`).
+Requests carry no trustworthy sending time, and a proxy may keep a connection open. But a client that returns the token
+of an answer has sent its request after it read that answer (as with pings, see
+:mod:`relay_server.sessions.keepalive`).
 """
 
 from __future__ import annotations
@@ -13,21 +13,24 @@ from collections.abc import Callable
 
 from relay_protocol.errors import Refused
 
-HEADER = "switchboard-moment"
-"""The header field, of answers and of requests."""
+HEADER = "switchboard-freshness"
+"""Header field of answers and requests."""
 
-NEEDED = f"say when this was sent, by giving back the '{HEADER}' of this or the latest answer"
-"""What those are told who do not."""
+PARAMETER = "freshness"
+"""Query parameter of requests that may move a robot, for clients that can't set a header."""
+
+NEEDED = f"prove that this is fresh: give back the '{HEADER}' of this or the latest answer"
+"""Error text for a request that needs a token and has none."""
 
 _KEY_BYTES = 32
 _SIGNATURE = 16
-"""Hexadecimal digits; whoever guesses right makes his own commands seem younger, and no others."""
+"""Hexadecimal digits. A client that guesses them can only make its own commands seem younger."""
 
 
 class FreshnessTokenRequired(Refused):
-    """A request that moves a robot, or lets it move again, does not say when it was sent."""
+    """A request that moves or resumes a robot has no freshness token of this relay."""
 
-    code = "moment_needed"
+    code = "freshness_required"
 
 
 class FreshnessTokenExpired(Refused):
@@ -37,7 +40,7 @@ class FreshnessTokenExpired(Refused):
 
 
 class FreshnessTokens:
-    """Makes and reads them. Those of a relay that ran before mean nothing to this one.
+    """Makes and reads freshness tokens. Tokens of an earlier run of the relay are not valid.
 
     :param clock_ns: the relay's monotonic nanoseconds
     """
@@ -47,33 +50,33 @@ class FreshnessTokens:
         self._key = secrets.token_bytes(_KEY_BYTES)
 
     def now(self) -> str:
-        """This moment."""
+        """A token for an answer that is sent now."""
         text = format(self._clock_ns(), "x")
         return f"{text}.{self._sign(text)}"
 
     def read(self, text: str | None) -> int | None:
-        """The monotonic nanoseconds of a moment, if a request names one.
+        """When a token was made, monotonic nanoseconds; ``None``: there is no token.
 
-        :raises MomentNeeded: it is none of this relay's
+        :raises FreshnessTokenRequired: it is no token of this relay
         """
         if text is None:
             return None
-        said, _, signature = text.strip().partition(".")
-        if not hmac.compare_digest(signature.encode(), self._sign(said).encode()):
+        made_at, _, signature = text.strip().partition(".")
+        if not hmac.compare_digest(signature.encode(), self._sign(made_at).encode()):
             raise FreshnessTokenRequired(
-                f"'{HEADER}' is no moment of this relay; give back the one of its latest answer"
+                f"'{HEADER}' is no token of this relay; give back the one of its latest answer"
             )
-        return int(said, 16)
+        return int(made_at, 16)
 
     def needed(self, text: str | None) -> int:
-        """The same where nothing is done without one.
+        """As :meth:`read`, for a request that needs a token.
 
-        :raises MomentNeeded: the request names none, or none of this relay's
+        :raises FreshnessTokenRequired: there is no token, or it is no token of this relay
         """
-        moment = self.read(text)
-        if moment is None:
+        made_at = self.read(text)
+        if made_at is None:
             raise FreshnessTokenRequired(NEEDED)
-        return moment
+        return made_at
 
     def _sign(self, text: str) -> str:
         return hmac.digest(self._key, text.encode(), "sha256").hex()[:_SIGNATURE]

@@ -1,9 +1,9 @@
-"""Writing without delay and without waste: at once when nothing waits, else joined, once a turn of the reactor.
+"""Writes to sockets directly, and joins messages that follow closely into one write for each reactor turn.
 
-Twisted keeps what is written until the socket is reported writable: one more turn, and two calls to the kernel to
-ask for the report and to take that back. Here a message goes to the socket directly. What follows closely is joined
-and goes at the end of the turn: a flood costs one call to the kernel, not one a message. What the socket does not take
-goes into Twisted's own buffer, which pauses the producer as ever.
+Twisted buffers what is written until the socket is reported writable, which costs one more turn and two system calls.
+Here a message is written to the socket at once. Messages that follow closely are joined and written at the end of the
+turn, so a flood costs one system call, not one for each message. Bytes that the socket does not accept go into
+Twisted's buffer, which pauses the producer as usual.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from twisted.internet.tcp import Server
 from relay_server.common.clock import Clock
 
 APART_SECONDS = 0.0005
-"""Messages that come so far apart are sent one by one. To ask the reactor where a turn begins would cost more."""
+"""Messages this far apart are written one by one. Finding out where a reactor turn begins would cost more."""
 
 JOINED_BYTES = 32 * 1024
-"""So much is not held until the end of the turn: the socket takes it now, or Twisted has to know that it is full."""
+"""Joined bytes that are written before the end of the turn, so that Twisted learns soon if the socket is full."""
 
 
 TICK_SECONDS = 0.02
-"""How often it is looked whether the reactor stands still; a turn that takes less is not noticed."""
+"""Seconds between checks whether the reactor stands still; shorter stalls are not noticed."""
 
 TICKS = 50
-"""It is looked so often after the last time anybody asked."""
+"""Checks after the latest call of :meth:`Stalls.seconds`."""
 
 UNLIMITED = 1 << 62
-"""Budget of a writer that nobody limits."""
+"""Budget of a writer without a limit."""
 
 
 class FlushScheduler:
-    """Flushes writers when a turn of the reactor is over. One for all writers of a listening port.
+    """Flushes writers at the end of a reactor turn. One serves all writers of a listening port.
 
     :param clock: the reactor, or one in a test
     """
@@ -43,12 +43,12 @@ class FlushScheduler:
         self._clock = clock
         self.seconds = clock.seconds
         self.stalls = Stalls(clock)
-        self._held: list[SocketWriter] = []
+        self._held: list[DirectSocketWriter] = []
 
-    def hold(self, writer: SocketWriter) -> None:
+    def schedule(self, writer: DirectSocketWriter) -> None:
         """Flush this writer at the end of the turn."""
         if not self._held:
-            # The reactor makes due calls before it looks for events again.
+            # The reactor makes due calls before it polls for events again.
             self._clock.callLater(0, self._over)
         self._held.append(writer)
 
@@ -59,9 +59,9 @@ class FlushScheduler:
 
 
 class Stalls:
-    """A clock that stands still while the reactor does, so that a busy relay is not taken for a slow connection.
+    """A clock that stands still while the reactor does, so that a busy relay does not look like a slow connection.
 
-    It is exact to :data:`TICK_SECONDS` while it is asked for at least once a second.
+    It is exact to :data:`TICK_SECONDS` while it is read at least once a second.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -69,10 +69,10 @@ class Stalls:
         self._stalled = 0.0
         self._due = 0.0
         self._left = 0
-        """Ticks until it is no longer looked."""
+        """Checks until they stop."""
 
     def seconds(self) -> float:
-        """Monotonic seconds, without those for which the reactor stood still."""
+        """Monotonic seconds, without the time for which the reactor stood still."""
         now = self._clock.seconds()
         if not self._left:
             self._tick_from(now)
@@ -94,137 +94,139 @@ class Stalls:
 
 
 class TransportWriter(Protocol):
-    """In front of a transport. All that goes over the transport must go through it, or order is lost.
+    """In front of a transport. Everything must be written through it, otherwise the order is lost.
 
-    :ivar budget: bytes that may be written until ``spent`` is called, see :mod:`relay_server.common.pacing`
-    :ivar spent: takes the data that exceeds the budget, instead of it being written; ``budget`` is negative then
+    :ivar budget: bytes that may be written until ``over_budget`` is called, see :mod:`relay_server.common.pacing`
+    :ivar over_budget: called with data that exceeds the budget, instead of writing it
     """
 
     budget: int
-    spent: Callable[[bytes], None]
+    over_budget: Callable[[bytes], None]
 
     def write(self, data: bytes) -> None:
-        """Send, now or at the end of the turn."""
+        """Write, now or at the end of the turn."""
 
-    def urgent(self, data: bytes) -> None:
-        """The same without a look at the budget."""
+    def write_beyond_budget(self, data: bytes) -> None:
+        """As :meth:`write`, whatever the budget."""
 
     def flush(self) -> None:
-        """Send what is held. Call before the transport is told to close."""
+        """Write what is held. To be called before the transport is closed."""
 
 
 def _unlimited(data: bytes) -> None:
-    raise AssertionError(f"{len(data)} bytes exceed a budget that nobody set")
+    raise AssertionError(f"{len(data)} bytes exceed a budget that was never set")
 
 
-class SocketWriter:
-    """In front of a plain TCP connection."""
+class DirectSocketWriter:
+    """Writes to the socket of a TCP connection without TLS, past Twisted while that has no bytes to send."""
 
     __slots__ = (
-        "_behind",
+        "_flushes",
         "_held",
         "_held_bytes",
         "_seconds",
         "_sent_at",
         "_socket",
         "_transport",
-        "_turns",
+        "_twisted_has_bytes",
         "budget",
-        "spent",
+        "over_budget",
     )
 
-    def __init__(self, transport: Any, turns: FlushScheduler) -> None:
+    def __init__(self, transport: Any, flushes: FlushScheduler) -> None:
         self._transport = transport
         self._socket = transport.getHandle()
-        self._turns = turns
-        self._seconds = turns.seconds
-        self._behind = True
-        """Whether Twisted may have bytes of this connection: whoever had it before may have left some."""
+        self._flushes = flushes
+        self._seconds = flushes.seconds
+        self._twisted_has_bytes = True
+        """Whether Twisted may have bytes to send; earlier users of the connection may have left some."""
         self._sent_at = -math.inf
         self._held: list[bytes] = []
         self._held_bytes = 0
         self.budget = UNLIMITED
-        self.spent: Callable[[bytes], None] = _unlimited
+        self.over_budget: Callable[[bytes], None] = _unlimited
 
     def write(self, data: bytes) -> None:
-        """At once if nothing was sent just before, else at the end of the turn."""
-        self.budget -= len(data)
-        if self.budget < 0:
-            self.spent(data)
+        """Write at once if nothing was written just before, else at the end of the turn."""
+        size = len(data)
+        budget = self.budget - size
+        if budget < 0:
+            self.over_budget(data)
             return
+        self.budget = budget
         if not self._held:
             now = self._seconds()
             if now - self._sent_at >= APART_SECONDS:
                 self._sent_at = now
-                self._put(data)
+                self._send(data)
                 return
-            self._turns.hold(self)
+            self._flushes.schedule(self)
         self._held.append(data)
-        self._held_bytes += len(data)
-        if self._held_bytes >= JOINED_BYTES:
+        self._held_bytes = size = self._held_bytes + size
+        if size >= JOINED_BYTES:
             self.flush()
 
-    def urgent(self, data: bytes) -> None:
+    def write_beyond_budget(self, data: bytes) -> None:
         """See :class:`TransportWriter`."""
         self.budget += len(data)
         self.write(data)
 
     def flush(self) -> None:
-        """What was held, in one piece."""
+        """Write what is held, in one piece."""
         if self._held:
             data = b"".join(self._held)
             self._held.clear()
             self._held_bytes = 0
-            self._put(data)
+            self._send(data)
 
-    def _put(self, data: bytes) -> None:
-        if self._behind:
-            # Bytes that Twisted still has go first. ``_tempDataLen`` (written, not yet joined) and ``dataBuffer``
-            # (being sent) are all it keeps; they are only read here, and the tests notice when they are not that any
-            # more.
+    def _send(self, data: bytes) -> None:
+        if self._twisted_has_bytes:
+            # Bytes that Twisted still has go first: those counted by ``_tempDataLen`` (written, not yet joined) and
+            # those in ``dataBuffer`` (being sent). Both are only read here; tests show if a new Twisted changes them.
             transport = self._transport
             if transport._tempDataLen or transport.dataBuffer:
                 transport.write(data)
                 return
-            self._behind = False
+            self._twisted_has_bytes = False
         try:
             sent = self._socket.send(data)
         except OSError:
-            # Full, broken or closed: Twisted finds out which when it writes, and tells the protocol.
+            # Full, broken or closed: Twisted finds out when it writes, and notifies the protocol.
             sent = 0
         if sent < len(data):
-            self._behind = True
+            self._twisted_has_bytes = True
             self._transport.write(data[sent:])
 
 
-class PlainWriter:
-    """In front of any other transport. TLS joins small writes of a turn itself."""
+class PassThroughWriter:
+    """Passes each message on to the transport at once: for TLS, which joins the small writes of a turn itself."""
 
-    __slots__ = ("_write", "budget", "spent")
+    __slots__ = ("_write", "budget", "over_budget")
 
     def __init__(self, transport: Any) -> None:
         self._write = transport.write
         self.budget = UNLIMITED
-        self.spent: Callable[[bytes], None] = _unlimited
+        self.over_budget: Callable[[bytes], None] = _unlimited
 
     def write(self, data: bytes) -> None:
-        """To the transport."""
-        self.budget -= len(data)
-        if self.budget < 0:
-            self.spent(data)
+        """Write to the transport."""
+        budget = self.budget - len(data)
+        if budget < 0:
+            self.over_budget(data)
         else:
+            self.budget = budget
             self._write(data)
 
-    def urgent(self, data: bytes) -> None:
+    def write_beyond_budget(self, data: bytes) -> None:
         """See :class:`TransportWriter`."""
         self._write(data)
 
     def flush(self) -> None:
-        """Nothing is held."""
+        """Nothing: no data is held here."""
 
 
-def writer_for(transport: Any, turns: FlushScheduler) -> TransportWriter:
-    """The writer for a connection; bytes may be put on its socket only when nothing else writes there."""
+def writer_for(transport: Any, flushes: FlushScheduler) -> TransportWriter:
+    """The writer for a connection. It writes to the socket itself only if nothing but Twisted's TCP does."""
     if type(transport) is Server and not transport.TLS:
-        return SocketWriter(transport, turns)
-    return PlainWriter(transport)
+        return DirectSocketWriter(transport, flushes)
+    return PassThroughWriter(transport)

@@ -1,4 +1,4 @@
-"""A token bucket: so many at once, so many a second after that."""
+"""Token buckets: they allow bursts and bound the rate in the long run."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable, Hashable
 
 
 class TokenBucket:
-    """Allows bursts, bounds the rate in the long run.
+    """One token bucket.
 
-    :param rate: tokens a second
-    :param burst: tokens it holds at most
-    :param seconds: a clock; one that is set back stands still for the bucket
+    :param rate: tokens per second
+    :param burst: most tokens it holds
+    :param seconds: a clock; when it is set back, no tokens are added
     """
 
     __slots__ = ("_at", "_burst", "_rate", "_seconds", "_tokens")
@@ -25,25 +25,22 @@ class TokenBucket:
 
     @property
     def wait(self) -> float:
-        """Seconds until one more may pass; 0 when it may now."""
+        """Seconds until one token is there; 0 if there is one now."""
         return self.wait_for(1)
 
     def wait_for(self, cost: float) -> float:
-        """The same for what takes so many tokens."""
+        """Seconds until ``cost`` tokens are there."""
         self._fill()
         return max(0.0, (cost - self._tokens) / self._rate)
 
     @property
     def left(self) -> float:
-        """Tokens it holds now."""
+        """Tokens now."""
         self._fill()
         return self._tokens
 
     def take(self, cost: float = 1) -> bool:
-        """Whether one more may pass now; if so it is counted.
-
-        :param cost: tokens that it takes
-        """
+        """Take ``cost`` tokens if they are there; returns whether they were."""
         self._fill()
         if self._tokens < cost:
             return False
@@ -51,7 +48,7 @@ class TokenBucket:
         return True
 
     def give_back(self) -> None:
-        """What was taken for one counts elsewhere."""
+        """Return one token."""
         self._tokens = min(self._burst, self._tokens + 1)
 
     def _fill(self) -> None:
@@ -61,10 +58,11 @@ class TokenBucket:
 
 
 class Buckets:
-    """A bucket for each of those who take from one; the longest unused are forgotten first.
+    """A token bucket per key. The longest unused are forgotten first.
 
-    :param rate: as of :class:`TokenBucket`, for each
-    :param most: buckets that are kept
+    :param rate: of each bucket, tokens per second
+    :param burst: of each bucket
+    :param most: buckets kept
     """
 
     def __init__(self, rate: float, burst: float, most: int, seconds: Callable[[], float]) -> None:
@@ -74,16 +72,16 @@ class Buckets:
         self._seconds = seconds
         self._buckets: OrderedDict[Hashable, TokenBucket] = OrderedDict()
 
-    def take(self, who: Hashable) -> bool:
-        """As :meth:`TokenBucket.take`."""
-        return self.of(who).take()
+    def take(self, key: Hashable) -> bool:
+        """Take one token of this key; see :meth:`TokenBucket.take`."""
+        return self.of(key).take()
 
-    def of(self, who: Hashable) -> TokenBucket:
-        """The bucket of one of them."""
-        bucket = self._buckets.get(who)
+    def of(self, key: Hashable) -> TokenBucket:
+        """The bucket of a key."""
+        bucket = self._buckets.get(key)
         if bucket is None:
-            bucket = self._buckets[who] = TokenBucket(self._rate, self._burst, self._seconds)
-        self._buckets.move_to_end(who)
+            bucket = self._buckets[key] = TokenBucket(self._rate, self._burst, self._seconds)
+        self._buckets.move_to_end(key)
         while len(self._buckets) > self._most:
             self._buckets.popitem(last=False)
         return bucket

@@ -1,17 +1,25 @@
-"""Websocket messages as the relay sends them: unmasked, whole in one frame (RFC 6455 section 5.2), or in several frames
-on a connection that is too thin for them (section 5.4).
+"""Websocket messages of the relay: unmasked, whole in one frame (RFC 6455 section 5.2), or in several frames on a slow
+connection (section 5.4). Frames that it forwards for a client are masked (section 5.3).
 
-A message that goes to many clients is framed once. What a session hands to its transport are frames, so that edges
-need not look at them again.
+A message for many clients is framed once: sessions give whole frames to their transports.
 """
 
 from __future__ import annotations
 
+import os
 import struct
+
+try:
+    from websockets.speedups import apply_mask as apply_mask
+except ImportError:  # no wheel for this platform: right, but slow
+    from websockets.utils import apply_mask as apply_mask
+
 
 TEXT = 0x81
 BINARY = 0x82
+CLOSE = 0x88
 PING = 0x89
+PONG = 0x8A
 FIN = 0x80
 
 _SHORT = struct.Struct("!BB")
@@ -28,13 +36,20 @@ def text(payload: bytes) -> bytes:
 
 
 def text_of(head: bytes, body: bytes, tail: bytes) -> bytes:
-    """The frame of one text message that is made of three pieces: what is long is copied once only."""
-    return b"".join((_head(TEXT, len(head) + len(body) + len(tail)), head, body, tail))
+    """The frame of one text message made of three pieces; long pieces are copied only once."""
+    length = len(head) + len(body) + len(tail)
+    first = _MEDIUM.pack(TEXT, 126, length) if 126 <= length < 65536 else _head(TEXT, length)
+    return b"".join((first, head, body, tail))
 
 
 def binary(payload: bytes) -> bytes:
     """The frame of one binary message."""
     return _head(BINARY, len(payload)) + payload
+
+
+def binary_of(head: bytes, body: bytes) -> bytes:
+    """The frame of one binary message made of two pieces; a long body is copied only once."""
+    return b"".join((_head(BINARY, len(head) + len(body)), head, body))
 
 
 def ping(payload: bytes) -> bytes:
@@ -43,6 +58,16 @@ def ping(payload: bytes) -> bytes:
     :param payload: at most 125 bytes (section 5.5)
     """
     return _SHORT.pack(PING, len(payload)) + payload
+
+
+def masked(first: int, payload: bytes) -> bytes:
+    """A frame as a client sends it.
+
+    :param first: its first byte, such as :data:`TEXT`
+    """
+    head, mask = bytearray(_head(first, len(payload))), os.urandom(4)
+    head[1] |= 0x80
+    return bytes(head) + mask + apply_mask(payload, mask)
 
 
 def _head(first: int, length: int) -> bytes:
@@ -54,7 +79,7 @@ def _head(first: int, length: int) -> bytes:
 
 
 class Fragments:
-    """Whole messages, taken piece by piece. Only control frames may be sent between two pieces (section 5.4).
+    """Whole messages, sent in pieces. Only control frames may be sent between two pieces (section 5.4).
 
     :param frames: one or more messages, each whole in one frame
     """
@@ -67,21 +92,28 @@ class Fragments:
         self._frames = memoryview(frames)
         self._at = 0
         self._left = 0
-        """Bytes of the payload of the message that was begun."""
+        """Bytes left of the payload of the message that was begun."""
         self._opcode = 0
 
     @property
     def left(self) -> int:
-        """Bytes that have not been taken, without the heads of further frames."""
+        """Bytes that are left, without the headers of further frames."""
         return len(self._frames) - self._at
+
+    @property
+    def begun(self) -> int:
+        """Bytes that are left of a message of which a part was taken; while there are any, no other may be sent."""
+        return self._left
 
     def take(self, most: int) -> bytes:
         """The next frame.
 
-        :param most: bytes of its payload, at least one
+        :param most: most bytes of its payload, at least one
         """
         if not self._left:
-            first, length, start = _parse(self._frames, self._at)
+            parsed = parse_head(self._frames, self._at)
+            assert parsed is not None
+            first, length, start = parsed
             if length <= most:
                 begun, self._at = self._at, start + length
                 return bytes(self._frames[begun : self._at])
@@ -93,10 +125,17 @@ class Fragments:
         return _head(first, size) + self._frames[begun : self._at]
 
 
-def _parse(frames: memoryview, at: int) -> tuple[int, int, int]:
-    """First byte, length of the payload and its place."""
+def parse_head(frames: bytes | memoryview, at: int) -> tuple[int, int, int] | None:
+    """First byte of an unmasked frame, length of its payload, and where the payload starts.
+
+    :returns: ``None`` if the head of the frame is incomplete
+    """
+    if len(frames) - at < 2:
+        return None
     first, length = frames[at], frames[at + 1]
     if length < 126:
         return first, length, at + 2
     end = at + (4 if length == 126 else 10)
+    if end > len(frames):
+        return None
     return first, int.from_bytes(frames[at + 2 : end], "big"), end

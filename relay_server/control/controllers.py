@@ -1,4 +1,4 @@
-"""Control of all robots of a relay."""
+"""The controllers of all robots of a relay, and their stops stored in the database."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from typing import NamedTuple
 from relay_db.queries import StopRecord
 from relay_protocol.clocks import now_ns
 from relay_server.common.clock import Clock
-from relay_server.control.audit import AuditSink
 from relay_server.control.controller import RobotController
 from relay_server.control.lease import FREE
+from relay_server.control.records import AuditSink
 from relay_server.control.stopping import StopState
+from relay_server.control.stored_stops import PendingStops
 from relay_server.control.types import ControlRules, ControlSnapshot
 from relay_server.robots.registry import RobotState
 
 
-class _Expected(NamedTuple):
-    """An order to stop that the database has.
+class _StoredStop(NamedTuple):
+    """A stop stored in the database.
 
-    :param seen: when it was first read there, the relay's monotonic nanoseconds
+    :param seen: when it was first read from there, the relay's monotonic nanoseconds
     """
 
-    order: StopRecord
+    stop: StopRecord
     seen: int
 
 
 class Controllers:
-    """One desk for each robot, made when somebody first asks for it.
+    """One controller for each robot, made when it is first needed.
 
-    :param changed: called when what the list of robots shows is another
+    :param changed: called when an entry of the list of robots has changed
     :param wall: Unix time in seconds
     :param clock_ns: the relay's monotonic nanoseconds
     """
@@ -38,6 +39,7 @@ class Controllers:
         self,
         clock: Clock,
         record: AuditSink,
+        stop_store: PendingStops,
         rules: ControlRules,
         changed: Callable[[], None],
         wall: Callable[[], float],
@@ -45,64 +47,73 @@ class Controllers:
     ) -> None:
         self._clock = clock
         self._record = record
+        self._stop_store = stop_store
         self._rules = rules
         self._changed = changed
         self._wall = wall
         self._clock_ns = clock_ns
-        self._desks: dict[int, RobotController] = {}
-        self._expected: dict[int, _Expected] = {}
+        self._controllers: dict[int, RobotController] = {}
+        self._stored_stops: dict[int, _StoredStop] = {}
 
     def __iter__(self) -> Iterator[RobotController]:
-        return iter(list(self._desks.values()))
+        return iter(list(self._controllers.values()))
 
     def of(self, robot: RobotState) -> RobotController:
-        """The robot's desk."""
-        desk = self._desks.get(robot.robot_id)
-        if desk is None:
-            rooms = self._clock, robot, self._record, self._rules, self._changed, self._wall, self._clock_ns
-            desk = self._desks[robot.robot_id] = RobotController(*rooms)
-            expected = self._expected.pop(robot.robot_id, None)
-            if expected is not None:
-                desk.stopping.expect(*expected)
-        return desk
+        """The robot's controller."""
+        controller = self._controllers.get(robot.robot_id)
+        if controller is None:
+            controller = self._controllers[robot.robot_id] = RobotController(
+                clock=self._clock,
+                robot=robot,
+                record=self._record,
+                stop_store=self._stop_store,
+                rules=self._rules,
+                changed=self._changed,
+                wall=self._wall,
+                clock_ns=self._clock_ns,
+            )
+            stored = self._stored_stops.pop(robot.robot_id, None)
+            if stored is not None:
+                controller.stopping.add_stored(stored.stop, stored.seen)
+        return controller
 
-    def standing(self, robot_id: int) -> ControlSnapshot:
-        """Who commands a robot, and whether it is stopped, also of one that nobody has asked for yet."""
-        desk = self._desks.get(robot_id)
-        if desk is not None:
-            return desk.standing
-        expected = self._expected.get(robot_id)
-        order = None if expected is None else expected.order
-        return ControlSnapshot(
-            FREE, {}, None if order is None else StopState(order.by, order.why, order.at, False)
-        )
+    def snapshot(self, robot_id: int) -> ControlSnapshot:
+        """The control snapshot of a robot, also where it has no controller yet."""
+        controller = self._controllers.get(robot_id)
+        if controller is not None:
+            return controller.snapshot
+        stored = self._stored_stops.get(robot_id)
+        if stored is None:
+            return ControlSnapshot(FREE, {}, None)
+        stop = stored.stop
+        return ControlSnapshot(FREE, {}, StopState(stop.by, stop.why, stop.at, confirmed=False))
 
     def holder(self, robot: RobotState) -> int:
         """The number of the connection that has control of a robot, 0 for none."""
-        tenure = self.standing(robot.robot_id).lease.holder
-        return 0 if tenure is None else tenure.client.number
+        holder = self.snapshot(robot.robot_id).lease.holder
+        return 0 if holder is None else holder.client.number
 
-    async def coming(self, robot: RobotState) -> None:
-        """A robot has proved itself and is about to register: what it is to be told first is looked up.
+    async def robot_connecting(self, robot: RobotState) -> None:
+        """Read the stop that a robot must be sent first, when it has proved its identity and is about to register.
 
-        :raises SwitchboardError: nobody can say
+        :raises SwitchboardError: the database does not answer
         """
-        order = await self._record.pending(robot)
-        self.of(robot).stopping.expect(order, self._clock_ns())
+        stop = await self._stop_store.pending_stop(robot)
+        self.of(robot).stopping.add_stored(stop, self._clock_ns())
 
-    def expect(self, orders: Iterable[StopRecord]) -> None:
-        """Orders to stop, as the database has them. Robots that are there are told now."""
-        now, before = self._clock_ns(), self._expected
-        self._expected = {order.robot_id: _Expected(order, now) for order in orders}
+    def stored_stops_read(self, stops: Iterable[StopRecord]) -> None:
+        """Add the stops that were read from the database, and send new ones to robots that are online."""
+        now, before = self._clock_ns(), self._stored_stops
+        self._stored_stops = {stop.robot_id: _StoredStop(stop, now) for stop in stops}
         for robot_id, known in before.items():
-            if robot_id in self._expected and self._expected[robot_id].order == known.order:
-                self._expected[robot_id] = known
-        for desk in self:
-            order, seen = self._expected.pop(desk.robot.robot_id, (None, now))
-            if desk.stopping.expect(order, seen) and desk.robot.control is not None:
-                desk.stopping.came()
+            if robot_id in self._stored_stops and self._stored_stops[robot_id].stop == known.stop:
+                self._stored_stops[robot_id] = known
+        for controller in self:
+            stop, seen = self._stored_stops.pop(controller.robot.robot_id, (None, now))
+            if controller.stopping.add_stored(stop, seen) and controller.robot.control_link is not None:
+                controller.stopping.send_pending()
 
     def forget(self, robot_id: int) -> None:
-        """The robot was removed."""
-        self._desks.pop(robot_id, None)
-        self._expected.pop(robot_id, None)
+        """Drop the state of a removed robot."""
+        self._controllers.pop(robot_id, None)
+        self._stored_stops.pop(robot_id, None)

@@ -1,4 +1,4 @@
-"""Who moves one robot: a table of states, and a value that every change replaces as a whole (SPEC section 1.7)."""
+"""The lease of one robot: a table of states, and a value that every change replaces as a whole (SPEC 1.7)."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from relay_server.access import Permit
 
 
 class LeaseState(enum.Enum):
-    """How far control has come."""
+    """The state of control."""
 
     FREE = "free"
     ASKING = "asking"
-    """The robot has been told who is to have it, and nobody has it before it answers."""
+    """A client is to get control; until the robot confirms, no client has it."""
     RELEASING = "releasing"
-    """The robot has been told that nobody has it any more."""
+    """No client is to have control; the robot has not confirmed."""
     HELD = "held"
     REQUESTED = "requested"
-    """Held, and somebody else asks for it."""
+    """Held, and requested by another client."""
 
 
 class LeaseEvent(enum.Enum):
-    """What may happen to it."""
+    """Events that change the state of control."""
 
     GIVE = "give"
-    """Somebody is to have it."""
+    """A client is to get control."""
     FREE = "free"
-    """Nobody is to have it any more."""
+    """Control is to end."""
     DONE = "done"
-    """The robot obeys."""
+    """The robot has confirmed."""
     FAILED = "failed"
-    """It has not said that it does."""
+    """The robot has not confirmed."""
     REQUEST = "request"
     WITHDRAW = "withdraw"
-    """Nobody asks for it any more."""
+    """The request has ended."""
     LOST = "lost"
-    """The robot's link is gone, and with it whoever held control."""
+    """The robot's link is lost."""
 
 
 NEXT = {
@@ -61,13 +61,11 @@ NEXT = {
 
 
 class LeaseClient(Hashable, Protocol):
-    """One connection, as control knows it.
+    """One client connection, as far as control needs it.
 
-    :ivar number: the source of its commands
-    :ivar name: its user's
-    :ivar user: that user's number
-    :ivar address: where it is, for people
-    :ivar opened: the relay's clock when it came
+    :ivar number: identifies the connection as a source of commands
+    :ivar address: network address, for display
+    :ivar opened: when it was opened, seconds of the relay's clock
     """
 
     number: int
@@ -77,39 +75,39 @@ class LeaseClient(Hashable, Protocol):
 
     @property
     def name(self) -> str:
-        """Its user's name."""
+        """The name of its user."""
 
     @property
     def user(self) -> int:
-        """Whose it is."""
+        """The id of its user."""
 
-    def tell(self, level: str, text: str) -> None:
-        """Report something in words, to clients that want to hear it."""
+    def notify(self, level: str, text: str) -> None:
+        """Send a status message, if the client receives messages of this level."""
 
-    def driving_since(self) -> float:
-        """The relay's clock at its latest command that moves; now, while something it asked for moves the robot."""
+    def last_motion_at(self) -> float:
+        """Time of its latest moving command, by the relay's clock; now, while one of its goals moves the robot."""
 
-    def commanding_since(self) -> float:
-        """The same for its latest command, were it a zero or one that did not pass."""
+    def last_command_at(self) -> float:
+        """Time of its latest command, including zero and refused ones, seconds of the relay's clock."""
 
-    def heard_driving(self) -> float:
-        """The relay's clock when it last proved that it is there; endless once it has let go: its latest commands that
-        passed, one on each topic, were zero."""
+    def last_alive_while_driving(self) -> float:
+        """When it last proved to be alive while it drove, seconds of the relay's clock. Infinite once it has released
+        the controls: on each topic its latest command that passed was zero."""
 
     def control_changed(self) -> None:
-        """Who moves the robot has changed: what waited for it goes, or never will."""
+        """Called when the holder of control has changed: waiting commands are sent or dropped."""
 
 
 def owns(client: LeaseClient) -> bool:
-    """Whether the client is an owner of the robot, by its rights as they stand."""
+    """Whether the client is an owner of the robot by its current rights."""
     return client.permit.rules.level is Level.OWNER
 
 
 class Holder(NamedTuple):
-    """Somebody has control, or is to have it.
+    """A client that has control, or is to get it.
 
     :param since: Unix time, seconds
-    :param implicit: whether a command took it, and nobody who can be asked has said that he wants it
+    :param implicit: whether a command acquired it, and the client has not taken it explicitly since
     """
 
     client: LeaseClient
@@ -118,7 +116,7 @@ class Holder(NamedTuple):
 
 
 class ControlRequest(NamedTuple):
-    """Somebody asks for it.
+    """A request for control, while another client has it.
 
     :param since: Unix time, seconds
     :param until: Unix time from which an owner takes over by asking again
@@ -132,71 +130,71 @@ class ControlRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class Lease:
-    """Who has control of a robot, who is about to get it, who asks for it.
+    """The holder of control of a robot, the next one, and the request.
 
-    Commands of ``holder`` pass, and of nobody else: there is none before the robot has said that it obeys him.
+    Only commands of ``holder`` pass. It is ``None`` until the robot has confirmed.
 
-    :param coming: who is to have it when the robot has answered
+    :param pending_holder: the holder once the robot has confirmed
     """
 
     state: LeaseState = LeaseState.FREE
     holder: Holder | None = None
-    coming: Holder | None = None
+    pending_holder: Holder | None = None
     request: ControlRequest | None = None
 
     @property
     def settled(self) -> bool:
-        """Whether no answer of the robot is waited for."""
+        """Whether no confirmation of the robot is pending."""
         return self.state not in (LeaseState.ASKING, LeaseState.RELEASING)
 
     def held_by(self, client: LeaseClient) -> bool:
-        """Whether this connection moves the robot."""
+        """Whether this connection has control."""
         return self.holder is not None and self.holder.client is client
 
     def requested_by(self, client: LeaseClient) -> bool:
-        """Whether this connection asks for control."""
+        """Whether this connection requests control."""
         return self.request is not None and self.request.client is client
 
-    def coming_to(self, client: LeaseClient) -> bool:
-        """Whether this connection is to have control when the robot has answered."""
-        return self.coming is not None and self.coming.client is client
+    def pending_for(self, client: LeaseClient) -> bool:
+        """Whether this connection has control once the robot has confirmed."""
+        return self.pending_holder is not None and self.pending_holder.client is client
 
     def give(self, client: LeaseClient, now: float, implicit: bool = False) -> Lease:
-        """The robot is being told that this client is to have it. Who asked for it asks no more."""
-        return Lease(self._after(LeaseEvent.GIVE), coming=Holder(client, now, implicit))
+        """The lease when this client is to get control; it ends the request."""
+        return Lease(self._next_state(LeaseEvent.GIVE), pending_holder=Holder(client, now, implicit))
 
-    def meant(self) -> Lease:
-        """Who has control has said that he wants it."""
+    def made_explicit(self) -> Lease:
+        """The lease when the holder has taken control explicitly."""
         assert self.holder is not None
         return replace(self, holder=self.holder._replace(implicit=False))
 
     def free(self) -> Lease:
-        """The robot is being told that nobody has it."""
-        return Lease(self._after(LeaseEvent.FREE))
+        """The lease when control is to end."""
+        return Lease(self._next_state(LeaseEvent.FREE))
 
     def done(self, now: float) -> Lease:
-        """The robot obeys."""
-        state = self._after(LeaseEvent.DONE)
-        coming = self.coming
-        return Lease(state, holder=None if coming is None else coming._replace(since=now))
+        """The lease when the robot has confirmed."""
+        state = self._next_state(LeaseEvent.DONE)
+        pending = self.pending_holder
+        return Lease(state, holder=None if pending is None else pending._replace(since=now))
 
     def failed(self) -> Lease:
-        """It has not said that it does."""
-        return Lease(self._after(LeaseEvent.FAILED))
+        """The lease when the robot has not confirmed."""
+        return Lease(self._next_state(LeaseEvent.FAILED))
 
     def requested(self, request: ControlRequest) -> Lease:
-        """Somebody asks for it, in the place of who asked before."""
-        return replace(self, state=self._after(LeaseEvent.REQUEST), request=request)
+        """The lease when a client requests control; it ends an earlier request."""
+        return replace(self, state=self._next_state(LeaseEvent.REQUEST), request=request)
 
     def withdrawn(self) -> Lease:
-        """Nobody asks for it any more."""
-        return replace(self, state=self._after(LeaseEvent.WITHDRAW), request=None)
+        """The lease when the request has ended."""
+        return replace(self, state=self._next_state(LeaseEvent.WITHDRAW), request=None)
 
     def lost(self) -> Lease:
-        """The robot's link is gone."""
-        return Lease(self._after(LeaseEvent.LOST))
+        """The lease when the robot's link is lost."""
+        return Lease(self._next_state(LeaseEvent.LOST))
 
-    def _after(self, event: LeaseEvent) -> LeaseState:
+    def _next_state(self, event: LeaseEvent) -> LeaseState:
         following = NEXT.get((self.state, event))
         if following is None:
             raise ValueError(f"'{event.value}' can't happen while control is {self.state.value}")
@@ -204,4 +202,4 @@ class Lease:
 
 
 FREE = Lease()
-"""Nobody has it."""
+"""No client has control."""

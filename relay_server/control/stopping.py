@@ -1,8 +1,12 @@
-"""Stopping one robot, and letting it move again; a robot that is away is stopped first thing when it comes back."""
+"""The stop of one robot: sent, stored in the database until the robot confirms it, and in force until a resume.
+
+A stop in the database is still to be sent. It is deleted when the robot has confirmed it, or when a resume has
+withdrawn it (SPEC 1.7): :mod:`relay_server.control.stored_stops`.
+"""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,42 +17,36 @@ from twisted.logger import Logger
 from relay_db.queries import StopRecord
 from relay_protocol import link
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
-from relay_server.common.clock import Clock, detached, sleep
+from relay_protocol.limits import REASON_LENGTH
+from relay_server.common.clock import Clock
+from relay_server.common.concurrency import detached
 from relay_server.common.token_bucket import Buckets
-from relay_server.control.audit import WHY, Actor, AuditSink
-from relay_server.control.commands import NotDone, RobotCommands
+from relay_server.control.actor import Actor, local_actor
+from relay_server.control.orders import ControlOrders, OrderFailed
+from relay_server.control.records import AuditSink
+from relay_server.control.stored_stops import PendingStops, StopWriter
 from relay_server.robots.registry import RobotState
 
 STOP_SECONDS = 14.0
-"""A robot has so long to confirm that it stands: a switch in its hardware may take 6 s, and has to be thrown once more
-where the stop came in the middle of a resume."""
+"""Time for a robot to confirm a stop. A switch in its hardware may take 6 s, and has to be set twice where the stop
+arrives during a resume."""
 
-KEEPING = 8
-"""Orders to stop one robot that are being written at a time: who stops it again and again must not fill the database's
-queue. The robot is told all the same; where it can't be, whoever comes then is told that his order is not kept."""
+FURTHER_AUDITS_PER_SECOND = 3 / 60
+FURTHER_AUDITS_BURST = 3
+"""Rate and burst of one user's further stops that are audited. The robot receives all."""
 
-KNOWN = 256
-"""Orders to stop one robot that are remembered: a slow database may still tell of them."""
+USERS = 256
+"""Most users remembered for this rate and for ids of stops; the least recent are forgotten first."""
 
-PUT_AWAY_SECONDS = 10.0
-"""From one attempt to take out of the database what is over to the next."""
+IDS_PER_USER = 16
+"""Most ids of stops remembered for each user while a robot is stopped; the oldest are forgotten first."""
 
-AGAIN_A_SECOND = 3 / 60
-AGAIN_AT_ONCE = 3
-"""Of the stops of a robot that is stopped already, how many of one user are in the audit log. The robot gets all."""
-
-AGAIN_USERS = 256
-"""Users remembered for that; the longest quiet are forgotten first."""
-
-SAME_SECONDS = 2.0
-"""Who stops a robot once more for the same reason within so long has pressed once: a page sends that two ways."""
-
-AT_ONCE = 64
-"""Orders to stop one robot that are under way at a time; whoever comes then is stopping it already."""
+ORDERS_AT_ONCE = 64
+"""Most stop orders without an answer. Beyond this, the robot has been sent the stop often enough."""
 
 
-class RepeatedStop(NamedTuple):
-    """That a stopped robot was stopped once more.
+class FurtherStop(NamedTuple):
+    """A stop of a robot that was stopped already, by another request.
 
     :param since: Unix time, seconds
     """
@@ -59,41 +57,74 @@ class RepeatedStop(NamedTuple):
 
 
 class StopState(NamedTuple):
-    """That a robot is stopped.
+    """Why a robot is stopped.
 
-    :param since: Unix time, seconds; of what comes by two ways the later
-    :param told: whether the robot has confirmed it
-    :param again: the latest of those who have stopped it since: whoever lets it move goes over his head too
+    :param since: Unix time, seconds; of its latest duplicate, if any
+    :param confirmed: whether the robot has confirmed it
+    :param again: the latest further stop; a resume overrides that one too
     """
 
     by: str
     why: str
     since: float
-    told: bool
-    again: RepeatedStop | None = None
+    confirmed: bool
+    again: FurtherStop | None = None
 
 
-class StopId(NamedTuple):
-    """What stopped a robot that could move.
+class StopIncomplete(SwitchboardError):
+    """The robot is stopped, but could not do all that belongs to a stop.
 
-    :param at: the clock's seconds
+    :ivar reason: what failed, in the robot's words
     """
 
-    who: int | str
-    why: str
-    at: float
+    code = "not_done"
+
+    def __init__(self, robot: str, reason: str) -> None:
+        super().__init__(f"robot {robot} is stopped, but a part of the stop failed: {reason}")
+        self.reason = reason
 
 
 class StoppedSince(Refused):
-    """Somebody may have stopped the robot after it was asked for that it may move again."""
+    """The robot may have been stopped after this resume was sent."""
 
     code = "stopped_since"
+
+
+class StopIds:
+    """Ids of the stops that one robot has received since it could last move, separated by user.
+
+    One id of one user is one stop, by whatever paths it arrives: each later arrival is a duplicate. As ids are
+    separated, no user can pass off another's stop as a duplicate of their own. The command line has the same rule for
+    what it stores: :func:`relay_db.queries.order_stop_once`. The robot knows no ids: a stop that comes again is done
+    again.
+    """
+
+    def __init__(self) -> None:
+        self._seen: OrderedDict[int | str, deque[str]] = OrderedDict()
+
+    def is_duplicate(self, actor: Actor, stop_id: str) -> bool:
+        """Remember an id; return whether this user sent it before. A stop without an id is no duplicate."""
+        if not stop_id:
+            return False
+        user = actor.source if actor.user is None else actor.user
+        seen = self._seen.pop(user, None) or deque(maxlen=IDS_PER_USER)
+        duplicate = stop_id in seen
+        if not duplicate:
+            seen.append(stop_id)
+        self._seen[user] = seen
+        if len(self._seen) > USERS:
+            self._seen.popitem(last=False)
+        return duplicate
+
+    def clear(self) -> None:
+        """Forget all ids, as the robot may move: every later stop is new."""
+        self._seen.clear()
 
 
 class StopController:
     """The stop of one robot.
 
-    :param changed: called when it is another
+    :param changed: called when :attr:`stopped` has changed
     :param wall: Unix time in seconds
     :param clock_ns: the relay's monotonic nanoseconds
     """
@@ -104,8 +135,10 @@ class StopController:
         self,
         clock: Clock,
         robot: RobotState,
-        orders: RobotCommands,
+        orders: ControlOrders,
+        *,
         record: AuditSink,
+        store: PendingStops,
         changed: Callable[[], None],
         wall: Callable[[], float],
         clock_ns: Callable[[], int],
@@ -114,283 +147,267 @@ class StopController:
         self._robot = robot
         self._orders = orders
         self._record = record
+        self._writer = StopWriter(clock, robot, store)
         self._changed = changed
         self._wall = wall
         self._clock_ns = clock_ns
-        self._latest = 0
-        """When the robot was stopped the last time, as far as this relay knows; its monotonic nanoseconds."""
-        self._repeats = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, clock.seconds)
-        self._again: RepeatedStop | None = None
-        """Who stopped it last while it was stopped."""
-        self._press: StopId | None = None
-        self._same: float | None = None
-        """When what is one press with that came last; Unix time, seconds."""
+        self._last_stopped_at = 0
+        """When the robot was last stopped, as far as this relay knows; the relay's monotonic nanoseconds."""
+        self._further_audits = Buckets(FURTHER_AUDITS_PER_SECOND, FURTHER_AUDITS_BURST, USERS, clock.seconds)
+        self._ids = StopIds()
+        self._latest_further: FurtherStop | None = None
+        self._duplicate_at: float | None = None
+        """When a duplicate last arrived; Unix time, seconds."""
         self._pending: StopRecord | None = None
-        self._known: deque[float] = deque(maxlen=KNOWN)
-        """The moments that name the orders seen here, whatever has become of them. They are compared for being the
-        same only: clocks are set back."""
-        self._unsure: StopRecord | None = None
-        """An order that the robot has, but could not do all of: it may have forgotten it when it comes back."""
-        self._look = False
-        """Whether what the robot says next of itself shows if it still stands."""
-        self._under_way = 0
-        self._keeping: list[StopRecord] = []
-        """Orders that are being written."""
-        self._left: deque[float] = deque(maxlen=KNOWN)
-        """The moments of orders that are over, and may still be in the database."""
-        self._clearing = False
+        """A stop that the robot has not confirmed."""
+        self._incomplete: StopRecord | None = None
+        """A stop that the robot received but could not carry out completely. It may be without it when it returns."""
+        self._check_state = False
+        """Whether the next state from the robot shows if it is still stopped."""
+        self._unanswered_orders = 0
 
     @property
     def stopped(self) -> StopState | None:
-        """By whom and why the robot is stopped, as it says itself, or is going to be; ``None`` when it may move."""
-        told, pending, again = self._robot.safety.stopped, self._pending, self._again
-        if told is not None:
-            since = told.since if self._same is None else self._same
-            return StopState(told.by, told.why, since, True, again)
+        """Why the robot is stopped, by its own report or by a stop that it has not confirmed; ``None``: it may move."""
+        confirmed, pending, again = self._robot.motion_state.stopped, self._pending, self._latest_further
+        if confirmed is not None:
+            since = confirmed.since if self._duplicate_at is None else self._duplicate_at
+            return StopState(confirmed.by, confirmed.why, since, True, again)
         if pending is None:
             return None
-        # What the robot was not told of gives way to the latest order, which is not told twice.
+        # While the robot is offline, the latest stop replaces the first; do not show it twice.
         if again is not None and again.since == pending.at:
             again = None
-        return StopState(pending.by, pending.why, max(pending.at, self._same or 0.0), False, again)
+        return StopState(pending.by, pending.why, max(pending.at, self._duplicate_at or 0.0), False, again)
 
-    def stop(self, actor: Actor, why: str) -> Deferred[bool]:
-        """Stop the robot, and keep it stopped. The order is on its way when this returns.
+    def stop(self, actor: Actor, why: str, stop_id: str = "") -> Deferred[bool]:
+        """Stop the robot, and keep it stopped. The order is sent when this returns.
 
-        What comes back fires with true when the robot has done it, with false when it will as soon as it is back. It
-        fails with :class:`NotDone` when the robot is stopped but could not do all that belongs to it, and with
-        :class:`Unavailable` when the order could neither be given nor be kept.
+        :param stop_id: made by the client, see :class:`StopIds`. A duplicate is sent as every stop is, but not
+            recorded
+        :returns: fires with true when the robot has confirmed, with false when it will be stopped once it returns.
+            Fails with :class:`StopIncomplete` when the robot is stopped but could not do everything, and with
+            :class:`Unavailable` when the stop could neither be sent nor be stored
         """
-        order = StopRecord(self._robot.robot_id, actor.name, why[:WHY], self._wall())
-        self._known.append(order.at)
+        stop = StopRecord(self._robot.robot_id, actor.name, why[:REASON_LENGTH], self._wall(), stop_id)
+        self._writer.note(stop)
         first = self.stopped is None
-        self._latest = self._clock_ns()
-        self._count(order, actor, first)
-        audit = first or self._repeats.take(actor.source)
-        if self._pending is None or len(self._keeping) < KEEPING:
-            # Else those stand that are being written.
-            self._pending = order
+        self._last_stopped_at = self._clock_ns()
+        duplicate = self._identify(stop, actor, stop_id, first)
+        audit = first or self._further_audits.take(actor.source)
+        if self._pending is None or not self._writer.full:
+            # When the writer is full, the pending stop is being written, and a further one is only sent.
+            self._pending = stop
         self._changed()
-        return detached(self._stop(order, actor, audit))
+        return detached(self._stop(stop, None if duplicate else actor, audit))
 
-    def _count(self, order: StopRecord, actor: Actor, first: bool) -> None:
-        """See what whoever would let the robot move is told of an order.
+    def _identify(self, stop: StopRecord, actor: Actor, stop_id: str, first: bool) -> bool:
+        """Return whether this stop is a duplicate, and update the stop that is shown.
 
         :param first: whether the robot was not stopped before
         """
-        who = actor.source if actor.user is None else actor.user
-        press, before = StopId(who, order.why, self._clock.seconds()), self._press
         if first:
-            self._unpress()
-            self._press = press
-        elif before is not None and before[:2] == press[:2] and press.at - before.at <= SAME_SECONDS:
-            # It is told by another moment: that ends a press to resume.
-            self._same = order.at
-        else:
-            self._again = RepeatedStop(order.by, order.why, order.at)
+            self._forget_requests()
+        duplicate = self._ids.is_duplicate(actor, stop_id)
+        if duplicate:
+            # Shown with a new time, which ends a pending press to resume.
+            self._duplicate_at = stop.at
+        elif not first:
+            self._latest_further = FurtherStop(stop.by, stop.why, stop.at)
+        return duplicate
 
-    async def _stop(self, order: StopRecord, actor: Actor, audit: bool) -> bool:
-        # Before anything is written: nothing is as urgent.
-        given = self._tell(order)
-        keeping = detached(self._keep(order, actor, audit))
-        outcome = await _outcome(given)
-        # Whoever asked is not kept waiting by a database that hangs.
-        if outcome is None:
-            self._has(order)
-            keeping.addErrback(self._failed)
+    async def _stop(self, stop: StopRecord, actor: Actor | None, audit: bool) -> bool:
+        # Before anything is written, as the robot must stop at once.
+        sent = self._send(stop)
+        saving = detached(self._save(stop, actor, audit))
+        error = await _error_of(sent)
+        # The caller does not wait for a database that hangs.
+        if error is None:
+            self._set_confirmed(stop)
+            saving.addErrback(self._log_failure)
             return True
-        if isinstance(outcome, NotDone):
-            self._unsure = order
-            keeping.addErrback(self._failed)
-            raise outcome
-        kept = await _outcome(keeping)
-        if kept is not None:
-            raise Unavailable(f"{outcome}; and the order can't be kept for when it is back: {kept}")
+        if isinstance(error, OrderFailed):
+            self._incomplete = stop
+            saving.addErrback(self._log_failure)
+            raise StopIncomplete(self._robot.name, error.reason)
+        not_saved = await _error_of(saving)
+        if not_saved is not None:
+            raise Unavailable(f"{error}; and the stop cannot be stored for its return: {not_saved}")
         return False
 
-    async def _keep(self, order: StopRecord, actor: Actor, audit: bool) -> None:
-        if len(self._keeping) >= KEEPING:
-            self._record.note("robot.stopped", self._robot, actor, order.why, audit=audit)
-            raise Unavailable(f"{KEEPING} orders to stop {self._robot.name} are being written already")
-        self._keeping.append(order)
-        try:
-            await self._record.ordered(self._robot, order, actor, audit=audit)
-        finally:
-            self._keeping.remove(order)
+    async def _save(self, stop: StopRecord, actor: Actor | None, audit: bool) -> None:
+        """Record a stop, and store it in the database until it is confirmed.
+
+        :param actor: ``None`` for a duplicate, which is recorded already
+        :param audit: whether to write an audit entry
+        """
+        if actor is not None:
+            self._record.note("robot.stopped", self._robot, actor, stop.why, audit=audit)
+        await self._writer.save(stop)
         if self._pending is None:
-            self._put_away(order)
+            self._writer.delete(stop)
 
-    def _has(self, order: StopRecord) -> None:
-        """The robot has it: nobody need tell it again."""
-        self._believe(link.Stopped(by=order.by, why=order.why, since=order.at))
-        self._over(order)
-        self._put_away(order)
+    def _set_confirmed(self, stop: StopRecord) -> None:
+        """The robot has the stop: show it as confirmed, and send it no more."""
+        self._set_reported_stop(link.Stopped(by=stop.by, why=stop.why, since=stop.at))
+        self._clear_pending(stop)
+        self._writer.delete(stop)
 
-    def _believe(self, stopped: link.Stopped | None) -> None:
-        """The robot has done as it was told; how it says so of itself may come a moment later."""
-        safety = self._robot.safety
-        if (safety.stopped is None) is not (stopped is None):
-            self._robot.safety = structs.replace(safety, stopped=stopped)
+    def _set_reported_stop(self, stopped: link.Stopped | None) -> None:
+        """Apply a confirmation of the robot before its own state report arrives."""
+        state = self._robot.motion_state
+        if (state.stopped is None) is not (stopped is None):
+            self._robot.motion_state = structs.replace(state, stopped=stopped)
             self._changed()
 
-    def _over(self, order: StopRecord) -> None:
-        # One that was given meanwhile stands.
-        if self._pending is order:
+    def _clear_pending(self, stop: StopRecord) -> None:
+        # A later stop stays pending.
+        if self._pending is stop:
             self._pending = None
             self._changed()
 
-    def _put_away(self, order: StopRecord) -> None:
-        """Have the database tell nobody of an order that is over, a later relay neither; nobody waits for that."""
-        # What is being written is put away when it is there.
-        if order not in self._keeping and order.at not in self._left:
-            self._left.append(order.at)
-            if not self._clearing:
-                self._clearing = True
-                detached(self._clear()).addErrback(self._failed)
-
-    async def _clear(self) -> None:
-        try:
-            while self._left:
-                at = self._left[0]
-                try:
-                    await self._record.told(self._robot, at)
-                except SwitchboardError as error:
-                    robot, reason = self._robot.name, str(error)
-                    self.log.warn(
-                        "a stop of {robot} is over and still kept: {reason}", robot=robot, reason=reason
-                    )
-                    await sleep(self._clock, PUT_AWAY_SECONDS)
-                else:
-                    # It is not there where so many were over meanwhile that the oldest went.
-                    if at in self._left:
-                        self._left.remove(at)
-        finally:
-            self._clearing = False
-
-    def _failed(self, failure: Any) -> None:
-        """A robot that is told to stop again stands all the same."""
+    def _log_failure(self, failure: Any) -> None:
+        """Log a failed write; the robot is stopped regardless."""
         robot = self._robot.name
-        self.log.error("the stop of {robot} is not well kept: {reason}", robot=robot, reason=failure.value)
+        self.log.error(
+            "the stop of {robot} could not be stored or delivered: {reason}",
+            robot=robot,
+            reason=failure.value,
+        )
 
-    def _tell(self, order: StopRecord) -> Deferred[None]:
-        if self._under_way >= AT_ONCE:
-            given: Deferred[None] = Deferred()
-            given.errback(Unavailable(f"robot {self._robot.name} has been told to stop, and does not answer"))
-            return given
-        self._under_way += 1
-        given = self._orders.give(
-            lambda id: link.Stop(id=id, by=order.by[:255], why=order.why, at=order.at),
+    def _send(self, stop: StopRecord) -> Deferred[None]:
+        if self._unanswered_orders >= ORDERS_AT_ONCE:
+            sent: Deferred[None] = Deferred()
+            sent.errback(Unavailable(f"robot {self._robot.name} was sent the stop, and does not answer"))
+            return sent
+        self._unanswered_orders += 1
+        sent = self._orders.send(
+            lambda id: link.Stop(id=id, by=stop.by[:255], why=stop.why, at=stop.at),
             seconds=STOP_SECONDS,
             always=True,
         )
-        return given.addBoth(self._answered)
+        return sent.addBoth(self._order_ended)
 
-    def _answered(self, result: Any) -> Any:
-        self._under_way -= 1
+    def _order_ended(self, result: Any) -> Any:
+        self._unanswered_orders -= 1
         return result
 
-    def anew(self) -> None:
-        """The robot is stopped now: nothing that was asked for before lets it move again."""
-        self._latest = self._clock_ns()
-        self._unpress()
+    def stopped_elsewhere(self) -> None:
+        """Note a stop that this relay did not send: resumes sent before it are refused."""
+        self._last_stopped_at = self._clock_ns()
+        self._forget_requests()
 
-    def _unpress(self) -> None:
-        """Forget who has stopped it."""
-        self._again = self._press = self._same = None
+    def _forget_requests(self) -> None:
+        self._ids.clear()
+        self._latest_further = self._duplicate_at = None
 
-    def resume(self, actor: Actor, why: str, sent: int) -> Deferred[None]:
-        """Let the robot move again. A stop it was not told of is taken back.
+    def resume(self, actor: Actor, why: str, earliest_sent: int) -> Deferred[None]:
+        """Let the robot move again. A stop that the robot has not received is withdrawn.
 
-        What comes back fails with :class:`StoppedSince` when it can have been asked for before the robot was last
-        stopped, with :class:`NotDone` or :class:`Unavailable` when the robot has not done it. One that is
-        offline keeps what it was told, also where this relay has not seen it since it began.
+        An offline robot keeps a stop that it has received, even one from before this relay started.
 
-        :param sent: a moment before which it can't have been asked for, the relay's monotonic nanoseconds
+        :param earliest_sent: see :class:`relay_server.sessions.message_age.MessageAge`
+        :returns: fails with :class:`StoppedSince` when the robot may have been stopped after that, with
+            :class:`OrderFailed` or :class:`Unavailable` when the robot has not resumed
         """
-        return detached(self._resume(actor, why[:WHY], self._pending, sent))
+        return detached(self._resume(actor, why[:REASON_LENGTH], self._pending, earliest_sent))
 
-    async def _resume(self, actor: Actor, why: str, pending: StopRecord | None, sent: int) -> None:
+    async def _resume(self, actor: Actor, why: str, pending: StopRecord | None, earliest_sent: int) -> None:
         robot = self._robot
-        if sent < self._latest:
+        if earliest_sent < self._last_stopped_at:
             raise StoppedSince(
-                f"robot {robot.name} was stopped, or may have been, after you asked for this: see why it stands, and "
-                "resume it once more"
+                f"robot {robot.name} was stopped, or may have been, after you sent this: check why it is stopped, then "
+                "resume it again"
             )
-        told = robot.control is not None
-        if told:
-            await self._orders.give(
+        online = robot.control_link is not None
+        if online:
+            await self._orders.send(
                 lambda id: link.Resume(id=id, by=actor.name[:255], why=why), seconds=STOP_SECONDS, always=True
             )
-        elif robot.safety.stopped is not None:
+        elif robot.elsewhere:
             raise Unavailable(
-                f"robot {robot.name} is offline, and stopped: it can be resumed when it is back"
+                f"robot {robot.name} is connected to another relay, which needs the age of a resume: resume it in the "
+                "portal or over HTTP, or on the machine of that relay"
             )
-        elif pending is None or pending is self._unsure:
-            raise Unavailable(
-                f"robot {robot.name} is offline, and may be stopped: it can be resumed when it is back"
-            )
+        elif robot.motion_state.stopped is not None:
+            raise Unavailable(f"robot {robot.name} is offline, and stopped: resume it when it is back")
+        elif pending is None or pending is self._incomplete:
+            raise Unavailable(f"robot {robot.name} is offline, and may be stopped: resume it when it is back")
         else:
-            await self._record.told(robot, pending.at)
-        if told:
-            # What the robot has done is done, whatever the database says.
-            self._unpress()
-            self._believe(None)
+            await self._writer.delete_now(pending)
+        if online:
+            # The robot may move, even if the database fails.
+            self._forget_requests()
+            self._set_reported_stop(None)
         if pending is not None:
-            self._over(pending)
+            self._clear_pending(pending)
         self._record.note("robot.resumed", robot, actor, why)
-        if told and pending is not None:
-            self._put_away(pending)
+        if online and pending is not None:
+            self._writer.delete(pending)
 
     # --- the robot ----------------------------------------------------------------------------------------
 
-    def expect(self, order: StopRecord | None, seen: int) -> bool:
-        """What the database says is still to be told; whether that is new.
+    def add_stored(self, stop: StopRecord | None, seen: int) -> bool:
+        """Add a stop stored in the database; return whether it is new. The caller sends it.
 
-        :param seen: when it was first read there, the relay's monotonic nanoseconds
+        Every relay reads the stops again whenever the database has changed, so most are known already.
+
+        :param seen: when it was first read from there, the relay's monotonic nanoseconds
         """
-        if order is None:
+        if stop is None:
             return False
-        if order.at in self._known:
+        if self._writer.is_known(stop):
             if self._pending is None:
-                self._put_away(order)
+                self._writer.delete(stop)
             return False
-        self._known.append(order.at)
-        self._latest = max(self._latest, seen)
-        self._pending = order
+        self._writer.note(stop)
+        if self.stopped is None:
+            self._forget_requests()
+        # The command line has stored it if no relay answered. It may have arrived here all the same, or still arrive.
+        if self._ids.is_duplicate(local_actor(stop.by), stop.stop_id):
+            self._duplicate_at = stop.at
+        self._last_stopped_at = max(self._last_stopped_at, seen)
+        self._pending = stop
         self._changed()
         return True
 
-    def came(self) -> None:
-        """The robot is there: what it was not told yet it is told now."""
-        pending = self._pending
-        self._look = pending is not None and pending is self._unsure
-        if not self._look:
-            self._tell_pending()
+    def robot_online(self) -> None:
+        """Send the robot a stop that it has not confirmed.
 
-    def heard(self) -> None:
-        """The robot has said of itself whether it stands: one that has forgotten its stop is told again."""
-        if self._look:
-            self._look = False
-            if self._robot.safety.stopped is None:
-                self._tell_pending()
+        A robot that has carried out a part of it is asked again only if its next state shows no stop.
+        """
+        if self._pending is not None and self._pending is self._incomplete:
+            self._check_state = True
+        else:
+            self.send_pending()
 
-    def _tell_pending(self) -> None:
+    def state_received(self) -> None:
+        """Handle a state report: send the stop again to a robot that has lost it."""
+        if self._check_state:
+            self._check_state = False
+            if self._robot.motion_state.stopped is None:
+                self.send_pending()
+
+    def send_pending(self) -> None:
+        """Send the robot a stop that it has not confirmed, if there is one."""
+        self._check_state = False
         if self._pending is not None:
-            detached(self._catch_up(self._pending)).addErrback(self._failed)
+            detached(self._deliver(self._pending)).addErrback(self._log_failure)
 
-    async def _catch_up(self, order: StopRecord) -> None:
-        outcome = await _outcome(self._tell(order))
-        if outcome is not None:
-            robot = self._robot.name
-            self.log.error("robot {robot} was to be stopped: {reason}", robot=robot, reason=str(outcome))
-        if outcome is None:
-            self._has(order)
-        elif isinstance(outcome, NotDone):
-            self._unsure = order
+    async def _deliver(self, stop: StopRecord) -> None:
+        error = await _error_of(self._send(stop))
+        if error is None:
+            self._set_confirmed(stop)
+            return
+        if isinstance(error, OrderFailed):
+            self._incomplete = stop
+            error = StopIncomplete(self._robot.name, error.reason)
+        self.log.error(
+            "the stop of {robot} is not confirmed: {reason}", robot=self._robot.name, reason=str(error)
+        )
 
 
-async def _outcome(work: Any) -> SwitchboardError | None:
-    """What went wrong, if anything did."""
+async def _error_of(work: Any) -> SwitchboardError | None:
     try:
         await work
     except SwitchboardError as error:

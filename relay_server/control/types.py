@@ -1,4 +1,4 @@
-"""Words and rules of control: what else is needed to say who moves a robot."""
+"""Values and rules of control."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import NamedTuple
 from relay_protocol.rights import Operation
 from relay_server.access import Permit
 from relay_server.config import RelaySettings
-from relay_server.control.audit import Actor
 from relay_server.control.lease import Lease, LeaseClient
 from relay_server.control.stopping import StopState
 
@@ -16,32 +15,29 @@ ROBOT = "/"
 """The resource of the right to control: the robot as a whole."""
 
 IMPLICIT = "its first command"
-"""Why a program has control that has never asked for it."""
+"""The recorded reason where a command acquired control."""
 
 DESERTED_SECONDS = 2.0
-"""A user's other connection takes control by a command when the one that has it has given none for so long."""
-
-LET_GO_SECONDS = 0.5
-"""Silence of this length is letting go, as on the robot (SPEC 2.5)."""
+"""Seconds without a command of the holder, after which another connection of its user acquires control by a command."""
 
 TAKES_A_SECOND = 5.0
 TAKES_AT_ONCE = 20
-"""How often a user takes control of a robot or asks for it; each time is put on record."""
+"""Rate and burst at which a user may take or request control of a robot, as each time is recorded."""
 
-REST_SECONDS = 10.0
-"""Who was refused control asks the same holder for it again only after so long."""
+REFUSED_SECONDS = 10.0
+"""Seconds before a user who was refused control can ask the same holder again."""
 
 USERS = 256
-"""Users remembered for each robot; the longest quiet are forgotten first."""
+"""Most users remembered for each robot; the least recent are forgotten first."""
 
 
 class ControlRules(NamedTuple):
-    """How control is handed out.
+    """Settings of control.
 
-    :param explicit: no command takes a free robot; control is taken by ``/relay/take_control`` alone
-    :param grace: seconds the holder has to answer a request, before an owner may take over
-    :param idle: seconds without a command that moves, after which control is free again
-    :param request: seconds the holder has to answer a request, before it lapses: others may ask then
+    :param explicit: whether control has to be taken explicitly; else the first command to a free robot acquires it
+    :param grace: seconds the holder has to answer a request before an owner may take over
+    :param idle: seconds without a moving command after which control ends
+    :param request: seconds the holder has to answer a request before it lapses
     """
 
     explicit: bool = False
@@ -51,15 +47,15 @@ class ControlRules(NamedTuple):
 
     @classmethod
     def of(cls, settings: RelaySettings) -> ControlRules:
-        """As an operator has set them."""
-        asked = settings.control_grace, settings.control_idle, settings.control_request
-        return cls(settings.explicit_control, *asked)
+        """Take the rules from the relay's settings."""
+        times = settings.control_grace, settings.control_idle, settings.control_request
+        return cls(settings.explicit_control, *times)
 
 
 class ControlReply(NamedTuple):
-    """What becomes of something a client asks for.
+    """The answer to a request about control.
 
-    :param message: for people
+    :param message: for display
     """
 
     success: bool
@@ -67,7 +63,10 @@ class ControlReply(NamedTuple):
 
 
 class ControlSnapshot(NamedTuple):
-    """All that decides whether a command passes. Replaced as a whole: while it is the same object, so is the answer."""
+    """Everything that decides whether a command passes.
+
+    It is replaced as a whole when it changes, so that holders of the same object need not check again.
+    """
 
     lease: Lease
     suppressed: Mapping[str, frozenset[int]]
@@ -75,11 +74,7 @@ class ControlSnapshot(NamedTuple):
 
 
 def acts_for(permit: Permit, client: LeaseClient) -> bool:
-    """Whether who has this permit may use this connection's control: it is his own, and his token is not for less."""
+    """Whether the bearer of this permit may act for a connection: it belongs to the same user, and the scope of the
+    token allows control."""
     own = client.user == permit.principal.user_id
-    return own and (permit.principal.scope is None or permit.judge(Operation.CONTROL, ROBOT).allowed)
-
-
-def actor_of(client: LeaseClient) -> Actor:
-    """A client, as the record knows who does something."""
-    return Actor(client.name, f"user:{client.name}", client.user, client.address, client.number)
+    return own and (permit.principal.scope is None or permit.decide(Operation.CONTROL, ROBOT).allowed)

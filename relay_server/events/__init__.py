@@ -1,1 +1,1 @@
-"""Events of clients, robots and applications, stored for a while (SPEC section 1.14)."""
+"""Events of clients, robots and applications, stored for a while (SPEC 1.14)."""

@@ -1,138 +1,136 @@
-"""Events worth keeping, written to the database behind the scenes."""
+"""The event bus: each event that is published reaches all subscribers in the same turn of the reactor.
+
+Nothing is stored here; :mod:`relay_server.events.collector` puts into the event log what belongs there.
+
+The newest events of each realm in memory, for readers that follow new events.
+"""
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-from relay_db import queries
-from relay_server.auth.login_limiter import network_of
-from relay_server.common.database import AsyncDatabase
-from relay_server.common.token_bucket import TokenBucket
-
-BURST = 20
-RATE = 1.0
-"""Events of one cause: so many at once, and so many per second in the long run."""
-
-CAUSES = 10_000
-"""Causes remembered; the longest quiet are forgotten first."""
-
-WAITING = 128
-"""Events that wait for the database at a time. Logins write by the same door and must find it open."""
+from relay_db.queries import StoredEventRecord
+from relay_server.events.limits import RECENT
 
 
-Listener = Callable[[str, int | None, dict[str, Any]], None]
-"""Is told the kind of an event, the robot's number if it is about one, and what belongs to it."""
+@dataclass(frozen=True, slots=True)
+class BusEvent:
+    """Something that happened.
 
-Witness = Callable[[str, str, int | None, dict[str, Any]], None]
-"""The same, and second who says so."""
+    :param kind: such as ``robot.online``
+    :param robot_id: the number of the robot it is about, if it is about one
+    :param source: who caused it: ``relay``, ``user:<name>``, ``robot:<name>``
+    """
+
+    kind: str
+    robot_id: int | None
+    source: str
+    data: dict[str, Any]
 
 
-@dataclass
-class _Cause:
-    bucket: TokenBucket
-    suppressed: int = 0
+Subscriber = Callable[[BusEvent], None]
 
 
 class EventBus:
-    """Writes events without making anyone wait for the database, and no more of one cause than is bearable.
-
-    :param wall: Unix time in seconds
-    """
+    """Notifies subscribers. One that fails is logged and disturbs neither the others nor the publisher."""
 
     log = Logger()
 
-    def __init__(self, store: AsyncDatabase, wall: Callable[[], float]) -> None:
-        self._store = store
-        self._wall = wall
-        self._causes: OrderedDict[str, _Cause] = OrderedDict()
-        self._waiting = 0
-        self._witnesses: list[Witness] = []
+    def __init__(self) -> None:
+        self._subscribers: list[Subscriber] = []
 
-    def listen(self, listener: Listener) -> None:
-        """Have all that happens told to somebody at once, also what is not kept."""
-        self._witnesses.append(lambda kind, source, robot_id, data: listener(kind, robot_id, data))
+    def subscribe(self, subscriber: Subscriber) -> None:
+        """Call this for every event from now on."""
+        self._subscribers.append(subscriber)
 
-    def witness(self, witness: Witness) -> None:
-        """Have it told to somebody who wants to know who says so."""
-        self._witnesses.append(witness)
-
-    def tell(self, kind: str, robot_id: int, source: str = "relay", **data: Any) -> None:
-        """Something happened that is not worth keeping, but listeners may act by it."""
-        self._tell(kind, source, robot_id, data)
-
-    def event(
-        self,
-        kind: str,
-        source: str,
-        *,
-        cause: str,
-        robot_id: int | None = None,
-        user_id: int | None = None,
-        **data: Any,
-    ) -> bool:
-        """Something happened: ``kind`` such as ``robot.online``, ``source`` who says so.
-
-        :param cause: who can make this happen at will: an address, or something like ``robot:r2-d2``
-        :returns: whether it is kept. What is not is counted, and told with the next of the same cause.
-        """
-        self._tell(kind, source, robot_id, data)
-        cause = network_of(cause)
-        known = self._known(cause)
-        if self._waiting >= WAITING or not known.bucket.take():
-            if not known.suppressed:
-                self.log.warn("{cause} causes too many events; some are not kept", cause=cause)
-            known.suppressed += 1
-            return False
-        suppressed, known.suppressed = known.suppressed, 0
-        if suppressed:
-            self.log.warn("{count} events caused by {cause} were not kept", count=suppressed, cause=cause)
-            self._write("events.suppressed", "relay", {"cause": cause, "count": suppressed})
-        self._write(kind, source, data, robot_id, user_id)
-        return True
-
-    def _tell(self, kind: str, source: str, robot_id: int | None, data: dict[str, Any]) -> None:
-        for witness in self._witnesses:
+    def publish(self, kind: str, robot_id: int | None = None, source: str = "relay", **data: Any) -> None:
+        """Notify all subscribers of an event; see :class:`BusEvent`."""
+        event = BusEvent(kind, robot_id, source, data)
+        for subscriber in self._subscribers:
             try:
-                witness(kind, source, robot_id, data)
-            except Exception:  # what has happened goes on, and is kept, whatever becomes of what listens
-                self.log.failure("who listens to events failed at '{kind}'", kind=kind)
+                subscriber(event)
+            except Exception:  # a subscriber must not undo what has happened
+                self.log.failure("a subscriber failed at the event '{kind}'", kind=kind)
 
-    def _known(self, cause: str) -> _Cause:
-        known = self._causes.get(cause)
-        if known is None:
-            known = self._causes[cause] = _Cause(TokenBucket(RATE, BURST, self._wall))
-        self._causes.move_to_end(cause)
-        while len(self._causes) > CAUSES:
-            self._causes.popitem(last=False)
-        return known
 
-    def _write(
-        self,
-        kind: str,
-        source: str,
-        data: dict[str, Any],
-        robot_id: int | None = None,
-        user_id: int | None = None,
-    ) -> None:
-        self._waiting += 1
-        writing = self._store.write(
-            queries.record_event,
-            at=self._wall(),
-            kind=kind,
-            source=source,
-            robot_id=robot_id,
-            user_id=user_id,
-            data=data,
-        )
-        Deferred.fromCoroutine(writing).addErrback(
-            lambda failure: self.log.error("an event could not be kept: {reason}", reason=failure.value)
-        ).addBoth(self._written)
+MAX_FOLLOWED = 500
+"""Events that a follower gets at a time."""
 
-    def _written(self, _: object) -> None:
-        self._waiting -= 1
+
+class RecentEvents:
+    """The newest events of each realm; followers of these need not ask the database."""
+
+    def __init__(self, size: int = RECENT) -> None:
+        self._events: dict[str, deque[StoredEventRecord]] = {}
+        self._size = size
+        self._followers: set[EventFollower] = set()
+
+    def on_written(self, events: list[StoredEventRecord]) -> None:
+        """Add events that are in the database, and wake all followers."""
+        for each in events:
+            self._events.setdefault(each.realm, deque(maxlen=self._size)).append(each)
+        for follower in list(self._followers):
+            follower.wake()
+
+    def forget_realm(self, realm: str) -> None:
+        """Drop the events of a realm that was removed; a new one of its name is another."""
+        self._events.pop(realm, None)
+
+    def since(self, realm: str, number: int) -> list[StoredEventRecord] | None:
+        """The first :data:`MAX_FOLLOWED` events with greater numbers, in their order.
+
+        :returns: ``None`` when some of them are not in memory
+        """
+        events = self._events.get(realm)
+        if not events or events[0].number > number + 1:
+            return None
+        if events[-1].number - events[0].number != len(events) - 1:
+            # Another process wrote some of the numbers.
+            return None
+        begin = max(0, number + 1 - events[0].number)
+        return list(islice(events, begin, begin + MAX_FOLLOWED))
+
+    def subscribe(self, follower: EventFollower) -> None:
+        """Wake this follower whenever events are written."""
+        self._followers.add(follower)
+
+    def unsubscribe(self, follower: EventFollower) -> None:
+        """Stop waking it."""
+        self._followers.discard(follower)
+
+
+class EventFollower:
+    """A reader of new events.
+
+    :ivar number: of the last event that it was given
+    :ivar fresh: whether events were written since it last looked
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.fresh = False
+        self._wake: Deferred[None] | None = None
+
+    def wake(self) -> None:
+        """Let :meth:`news` return."""
+        self.fresh = True
+        wake, self._wake = self._wake, None
+        if wake is not None:
+            wake.callback(None)
+
+    async def news(self) -> None:
+        """Wait for :meth:`wake`."""
+        if self.fresh:
+            return
+        self._wake = Deferred()
+        try:
+            await self._wake
+        finally:
+            self._wake = None

@@ -1,6 +1,6 @@
-"""What leaves an event by itself: what the journal, the alerts and robots' graphs tell, in the words of the memory.
+"""Turns events of the bus, alerts and changes of robots' graphs into stored events.
 
-Nothing here is done for a sample, and nothing waits: what finds no room, or comes too often, is counted.
+Nothing here runs for a sample, and nothing waits. Events beyond the rate limit or the queue are dropped and counted.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from relay_db.base import canonical_json
 from relay_db.models import NAME
 from relay_db.names import sanitise
 from relay_db.queries import AlertRecord, NewStoredEvent
-from relay_db.queries.event_search import OURS
+from relay_db.queries.event_search import RELAY_SOURCE
 from relay_protocol.realms import DEFAULT_REALM
 from relay_server.common.token_bucket import Buckets
-from relay_server.events.limits import DATA, NOTED, NOTED_A_SECOND, NOTED_AT_ONCE
+from relay_server.events.bus import BusEvent
+from relay_server.events.limits import DATA, RATE_KEYS, RECORDED_A_SECOND, RECORDED_AT_ONCE
 from relay_server.events.writer import EventWriter
 from relay_server.robots.registry import RobotRegistry, RobotState
 
@@ -49,34 +50,55 @@ KINDS = frozenset(
         "call.ended",
         "goal.begun",
         "goal.ended",
+        "alert.acknowledged",
         "login.refused",
+        "client.refused",
+        "robot.refused",
+        "robot.enrolment_refused",
+        "fleet.done",
+        "recording.removed",
+        "module.ordered",
+        "module.changed",
+        "file.stored",
+        "file.deleted",
+        "pipe.started",
+        "pipe.ended",
+        "role.started",
+        "role.stopped",
+        "role.ended",
     }
 )
-"""What of the journal is noted (SPEC section 1.14)."""
+"""Kinds of the event bus that are stored (SPEC 1.14)."""
 
 _REALM = "realm"
-"""The field in which an event about no robot says whose it is: empty or ``None`` where nobody is to be told. To whom a
-failed login is told must not tell him what there is in other realms, so it is the one that was named, there or not."""
+"""The field with the realm of an event that is about no robot; without a value the event is not stored. Of a refused
+login it is the realm that the name gave, whether it exists or not: the answer must not show which realms exist."""
 
-_UNTOLD = frozenset({"robot", "user", "address"})
-"""Fields that an event has in other places, or that are not everybody's who may see the robot."""
+_OMITTED_FIELDS = frozenset({"robot", "user", "address"})
+"""Fields that a stored event has elsewhere, or that not every reader with a right on the robot may see."""
 
-_ONLY = {"recording.started": frozenset({"recording"}), "recording.ended": frozenset({"recording", "state"})}
-"""Fields of kinds of which no others are told: why a recording ended may name what not everybody may see."""
+_ONLY_FIELDS = {
+    "recording.started": frozenset({"recording"}),
+    "recording.ended": frozenset({"recording", "state"}),
+}
+"""All fields that are stored of these kinds: the reason why a recording ended may name restricted topics."""
 
-_AT_HOME = frozenset(_ONLY)
-"""Kinds that are told in the realm of who did it alone, as what was recorded stays there (SPEC section 3.1)."""
+_OWN_REALM_ONLY = frozenset(_ONLY_FIELDS)
+"""Kinds that are stored in the realm of their user alone, as recordings stay there (SPEC 3.1)."""
 
-_SHARES = {"module": "module", "video": "video"}
-"""Kinds, by what they begin with, that have a share of what may be noted for themselves: they take no room from what
-else somebody does, or becomes of a robot."""
+REFUSED = f"{RELAY_SOURCE}.refused"
+_SOURCES = dict.fromkeys(("client.refused", "robot.refused", "robot.enrolment_refused"), REFUSED)
+"""Kinds that any client can cause have a source of their own, so that they displace no other events."""
 
-_GUARDED = frozenset({"stale", "diagnostics", "key"})
-"""Kinds of alerts whose words take further rights (SPEC section 1.10); that there is one does not."""
+_SHARES = {"node": "node", "video": "video", "module": "module", "file": "file"}
+"""Prefixes of kinds with a rate limit of their own: many of them displace no other events of the user or robot."""
+
+_RESTRICTED_ALERTS = frozenset({"stale", "diagnostics", "key"})
+"""Kinds of alerts whose text takes further rights (SPEC 1.10)."""
 
 
 class EventCollector:
-    """See the module's text.
+    """Stores what happens in the relay, as far as it is for the event log.
 
     :param wall: Unix time in seconds
     :param seconds: a monotonic clock
@@ -92,68 +114,74 @@ class EventCollector:
         self._writer = writer
         self._registry = registry
         self._wall = wall
-        self._buckets = Buckets(NOTED_A_SECOND, NOTED_AT_ONCE, NOTED, seconds)
+        self._buckets = Buckets(RECORDED_A_SECOND, RECORDED_AT_ONCE, RATE_KEYS, seconds)
 
-    def happened(self, kind: str, source: str, robot_id: int | None, data: Mapping[str, Any]) -> None:
-        """An event of the journal, whether it is kept there or not."""
+    def on_bus_event(self, event: BusEvent) -> None:
+        """Store an event of the bus if it is of one of :data:`KINDS`."""
+        kind, robot_id, data = event.kind, event.robot_id, event.data
         if kind not in KINDS or data.get("snapshot"):
-            # Who asks for a picture a second would push out all else.
+            # Snapshots may come once a second; they would displace all other events.
             return
-        who, _, name = source.partition(":")
-        user = name if who == "user" else None
+        origin, _, name = event.source.partition(":")
+        user = name if origin == "user" else None
         if robot_id is None:
-            self._note(kind, None, user, data)
+            self._record(kind, None, user, data)
         else:
-            told = _ONLY.get(kind, data.keys()) - _UNTOLD
-            self._note(kind, robot_id, user, {name: value for name, value in data.items() if name in told})
+            fields = _ONLY_FIELDS.get(kind, data.keys()) - _OMITTED_FIELDS
+            self._record(
+                kind, robot_id, user, {name: value for name, value in data.items() if name in fields}
+            )
 
-    def modules(self, robot: RobotState, up: Iterable[str], down: Iterable[str]) -> None:
-        """Nodes have come into a robot's graph, and have gone, while it was online."""
-        for kind, nodes in (("module.up", up), ("module.down", down)):
-            for node in nodes:
-                self._note(kind, robot.robot_id, None, {"module": node})
+    def on_nodes_changed(self, robot: RobotState, up: Iterable[str], down: Iterable[str]) -> None:
+        """Store that nodes came into the graph of a robot that is online, or left it."""
+        for kind, names in (("node.up", up), ("node.down", down)):
+            for node in names:
+                self._record(kind, robot.robot_id, None, {"node": node})
 
-    def alert(self, what: str, alert: AlertRecord) -> None:
-        """An alert has begun, become worse, or is over."""
+    def on_alert(self, event: str, alert: AlertRecord) -> None:
+        """Store that an alert began, became worse, or ended."""
         data = {"alert": alert.id, "alert_kind": alert.kind, "level": alert.level}
-        if alert.kind not in _GUARDED:
+        if alert.kind not in _RESTRICTED_ALERTS:
             data |= {"about": alert.about, "text": alert.text}
-        self._note(f"alert.{what}", alert.robot_id, None, data)
+        self._record(f"alert.{event}", alert.robot_id, None, data)
 
-    def note(self, event: NewStoredEvent, by: str | None = None) -> None:
-        """What another part of this relay has put together; dropped where there were too many of late.
+    def record(self, event: NewStoredEvent, by: str | None = None) -> None:
+        """Store an event, unless too many of its kind came recently.
 
-        :param by: whose share of what may be noted it takes, where that is not the event's user
+        :param by: whose rate limit counts, where that is not the event's user
         """
-        share = _SHARES.get(event.kind.partition(".")[0], "")
-        if self._may_pass(event.realm, event.robot_id, by or event.user, share):
-            self._writer.note(event)
+        share = _SOURCES.get(event.kind) or _SHARES.get(event.kind.partition(".")[0], "")
+        if self._within_rate(event.realm, event.robot_id, by or event.user, share):
+            self._writer.append(event)
         else:
-            self._writer.drop(event.realm)
+            self._writer.count_drop(event.realm)
 
-    def _may_pass(self, realm: str, robot_id: int | None, user: str | None, share: str) -> bool:
-        """Whether there is one more; what strangers name for realms has one share together."""
-        return self._buckets.take((realm if self._writer.knows(realm) else None, robot_id, user, share))
+    def _within_rate(self, realm: str, robot_id: int | None, user: str | None, share: str) -> bool:
+        """Whether the rate limit allows one more. Names of realms that do not exist share one limit."""
+        return self._buckets.take((realm if self._writer.knows_realm(realm) else None, robot_id, user, share))
 
-    def _note(self, kind: str, robot_id: int | None, user: str | None, data: Mapping[str, Any]) -> None:
+    def _record(self, kind: str, robot_id: int | None, user: str | None, data: Mapping[str, Any]) -> None:
         robot = None if robot_id is None else self._registry.find(robot_id)
         if robot_id is not None and robot is None:
-            # It was removed: nobody may see this any more.
+            # The robot was removed, and all rights to see its events with it.
             return
         if robot is None:
             realm = data.get(_REALM, DEFAULT_REALM)
             if realm:
-                self.note(NewStoredEvent(realm, self._wall(), OURS, kind, None, _name(user), _text(data)))
+                source = _SOURCES.get(kind, RELAY_SOURCE)
+                self.record(NewStoredEvent(realm, self._wall(), source, kind, None, _name(user), _text(data)))
             return
-        # Whom it does not name with his realm is of the robot's own.
+        # A name without a realm is of the robot's own realm.
         name, at, of = (user or "").partition("@")
         for realm in sorted(robot.realms):
             mine = user is not None and realm == (of if at else robot.realm)
-            if kind in _AT_HOME and not mine:
+            if kind in _OWN_REALM_ONLY and not mine:
                 continue
-            told = data if mine or user is None else {**data, "by": user if at else f"{user}@{robot.realm}"}
-            source, who = f"{OURS}:{robot.name}", _name(name) if mine else None
-            self.note(NewStoredEvent(realm, self._wall(), source, kind, robot_id, who, _text(told)), by=user)
+            stored = data if mine or user is None else {**data, "by": user if at else f"{user}@{robot.realm}"}
+            source, own_user = f"{RELAY_SOURCE}:{robot.name}", _name(name) if mine else None
+            self.record(
+                NewStoredEvent(realm, self._wall(), source, kind, robot_id, own_user, _text(stored)), by=user
+            )
 
 
 def _name(user: str | None) -> str | None:
@@ -161,7 +189,7 @@ def _name(user: str | None) -> str | None:
 
 
 def _text(data: Mapping[str, Any]) -> str:
-    """Data as it is kept; words are cut, and what is too large all the same is left out."""
+    """Data as it is stored. Text is cut; data that is still too large is left out."""
     cut = {
         name: sanitise(value) if isinstance(value, str) else value
         for name, value in data.items()

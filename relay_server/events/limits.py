@@ -1,14 +1,14 @@
-"""The vocabulary of the memory: its limits. Imports nothing of ours."""
+"""The limits of the event log. Imports nothing of ours."""
 
 DATA = 4096
 """Most characters of an event's data, as JSON in ASCII."""
 
-SEVERAL = 100
+MAX_PER_REQUEST = 100
 """Events of one request, at most."""
 
 PAGE = 100
-LONGEST = 1000
-"""Events of an answer: of which nobody says how many, and at most."""
+MAX_PAGE = 1000
+"""Events of an answer: without ``limit``, and at most."""
 
 FIELDS = 8
 """Fields of the data that one query may name."""
@@ -18,51 +18,48 @@ TEXT = 255
 
 BATCH = 500
 GATHER_SECONDS = 0.02
-"""So many events, or what comes within this time, are written in one transaction."""
+"""So many events, or those that come within this time, are written in one transaction."""
 
 QUEUE = 5000
-"""Events that wait to be written; who brings more has to come again."""
+"""Events that wait to be written; requests with more are refused."""
 
-OWN_QUEUE = 2000
-"""Of these the relay's own fill no more."""
+RELAY_QUEUE = 2000
+"""Places of this queue that events of the relay may take."""
 
 RETRY_SECONDS = 1.0
-"""Pause after a write that the database refused, while events of the relay's own wait."""
+"""Pause after a failed write while events of the relay wait."""
 
-AGAIN_SECONDS = 1.0
-"""When who found the queue full should come again."""
+RETRY_AFTER_SECONDS = 1.0
+"""``Retry-After`` of a request that found the queue full."""
 
-DROPS_SECONDS = 10.0
-"""How many of the relay's own were dropped is told no more often in each realm."""
+DROP_REPORT_SECONDS = 10.0
+"""Shortest time between two reports of dropped events in a realm."""
 
-NOTED_A_SECOND = 20.0
-NOTED_AT_ONCE = 200
-"""What the relay notes of one user on one robot: so many events a second in the long run, and at once."""
+RECORDED_A_SECOND = 20.0
+RECORDED_AT_ONCE = 200
+"""Events that the relay stores of one user on one robot: a second in the long run, and at once."""
 
-NOTED = 10_000
-"""Users and robots of which that is counted; the longest quiet are forgotten first."""
-
-SOURCE_EVENTS = 10_000
-"""Events that each source may have in a realm."""
+RATE_KEYS = 10_000
+"""Users and robots that are counted for this; the longest quiet are dropped first."""
 
 REALM_EVENTS = 1_000_000
-"""Events that a realm may have, of all sources together."""
+"""Most events of a realm, of all sources together."""
 
-KEPT_SECONDS = 30 * 86400.0
-"""Older ones go."""
+RETENTION_SECONDS = 30 * 86400.0
+"""Older events are deleted."""
 
-ASKED = 64
-ASKED_EACH = 16
-"""Queries that wait for the database: of all, and of one user."""
+MAX_READS = 64
+MAX_READS_PER_USER = 16
+"""Reads that wait for the database: of all users, and of one."""
 
-LOOKS = 2
-"""Times that the database is asked for one page, or one count; what was not found by then is on the next one."""
+MAX_SCANS = 2
+"""Reads of the database for one page or count; the next page goes on from there."""
 
-COUNTED_USED = 100
-"""So many events that were counted, and no more, count as used by that."""
+MAX_COUNTED_AS_USED = 100
+"""A count of at most so many events counts as a use of each."""
 
-USES = 20_000
-"""Events of which uses wait to be written; of more they are not counted."""
+MAX_PENDING_USES = 20_000
+"""Events with uses that wait to be written; uses of further events are not counted."""
 
 RECENT = 5000
-"""Events that are kept at hand for who follows them."""
+"""Events of a realm in memory for followers."""

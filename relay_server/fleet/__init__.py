@@ -1,1 +1,1 @@
-"""One order to many robots (SPEC section 1.11)."""
+"""One order to many robots (SPEC 1.11)."""

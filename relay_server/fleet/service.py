@@ -1,4 +1,4 @@
-"""What edges ask about orders to many robots: who may give them to which robots, and how they are carried out."""
+"""Orders to many robots: rights, selection of robots, and how the orders are carried out."""
 
 from __future__ import annotations
 
@@ -20,103 +20,112 @@ from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.realms import DEFAULT_REALM, full_name
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.access import Access, Permit, Principal
+from relay_server.access import LOOKUP_SECONDS, NOT_LOOKED_UP, Access, Permit, Principal
 from relay_server.audit_log import AuditLog, AuditLogEntry
-from relay_server.common.clock import Clock, as_twisted, with_timeout
+from relay_server.cluster.fleet_orders import OrderForwarding
+from relay_server.common.clock import Clock, as_twisted
+from relay_server.common.concurrency import bounded_gather, with_timeout
 from relay_server.common.database import AsyncDatabase
-from relay_server.common.gather import bounded_gather
 from relay_server.common.token_bucket import Buckets
-from relay_server.control.audit import Actor
-from relay_server.control.controllers import Controllers
+from relay_server.control.actor import Actor, user_actor
+from relay_server.control.service import ControlService
 from relay_server.events.bus import EventBus
-from relay_server.fleet.order import Order, OrderAge
-from relay_server.fleet.result import TaskOutcome, TaskResult
-from relay_server.fleet.selection import GROUP, select_robots
-from relay_server.fleet.stop import FleetStop
-from relay_server.fleet.task import FleetTask
-from relay_server.http_sessions.loopback_client import LoopbackClient
+from relay_server.fleet.order import (
+    GROUP,
+    FleetOrderStart,
+    Order,
+    OrderAge,
+    RobotGroupInfo,
+    TaskOutcome,
+    TaskResult,
+    select_robots,
+)
+from relay_server.fleet.task import FleetStop, FleetTask
+from relay_server.in_process_sessions.in_process_port import InProcessPort
+from relay_server.modules.service import ModuleService, action_of, user_of
 from relay_server.robots.registry import RobotRegistry, RobotState
 from relay_server.sessions.manager import (
-    LOOKUP_SECONDS,
-    NOT_LOOKED_UP,
-    AuthorizedSession,
+    Admission,
     SessionManager,
     ShuttingDown,
 )
 
-ROBOTS = 1000
-"""Robots of one order, but for a stop, which may mean all there are."""
+MAX_ROBOTS = 1000
+"""Robots of one order, except for a stop, which may be for all robots."""
 
-ORDERS = 4
+MAX_ORDERS = 4
 """Orders of one user at a time."""
 
-STOPS_A_SECOND = 3 / 60
-STOPS_AT_ONCE = 10
-"""Orders to stop of one user that are in the audit log. What they stop is there by itself, robot by robot."""
+STOPS_PER_SECOND = 3 / 60
+STOPS_BURST = 10
+"""Stops of one user that enter the audit log: per second in the long run, and at once. The robots' own
+entries are written in any case."""
 
 STOP_USERS = 256
-"""Users remembered for that; the longest quiet are forgotten first."""
+"""Users remembered for that limit; those that were quiet longest are forgotten first."""
 
-STOP_SECONDS = 18.0
-"""What a stop and a resume have, whatever the order says: they are given up by who carries them out before that, though
-the database be asked first."""
+STOP_OR_RESUME_SECONDS = 19.0
+"""Time for a stop and a resume, whatever the order says: longer than the control service takes for them, even if the
+database is asked first."""
 
 LOCAL = Principal(0, "admin (local)", DEFAULT_REALM, True, 0, None)
-"""Whoever may open the relay's local socket. No user can have this name: it has a space in it."""
+"""Stands for any client of the relay's local socket. No user can have this name, since it contains a space."""
 
 
-def local_of(realm: str) -> Principal:
-    """The same, for the robots of a realm."""
+def local_principal(realm: str) -> Principal:
+    """The local administrator, for the robots of one realm."""
     return replace(LOCAL, realm=normalise(realm))
 
 
-def _is_local(asker: Principal) -> bool:
-    return asker.user_id == LOCAL.user_id
+def _is_local(principal: Principal) -> bool:
+    return principal.user_id == LOCAL.user_id
 
 
-OWNS = Rules([Grant(Level.OWNER, source=LOCAL.name)])
-"""What he may do on every robot."""
+LOCAL_RULES = Rules([Grant(Level.OWNER, source=LOCAL.name)])
+"""The local administrator's rights on every robot."""
 
 
 @dataclass(frozen=True)
 class FleetPlan:
-    """An order, and which robots it means.
+    """An order and its robots.
 
-    :param missed: why it may mean others, which nobody could look up
-    :param stopping: those that are being stopped already, and what comes of it
-    :param sent: a moment before which it can't have been given, the relay's monotonic nanoseconds, where one is known
+    :param missed: why the order may be for more robots, which could not be looked up
+    :param stopping: results of the robots that are being stopped already
+    :param earliest_sent: see :class:`relay_server.sessions.message_age.MessageAge`; ``None``: unknown
+    :param forwarded: whether another relay has sent it, as its robot is here
     """
 
     order: Order
-    asker: Principal
+    principal: Principal
     address: str
     robots: dict[str, RobotRecord]
     unmatched: list[str]
     missed: str = ""
     stopping: Mapping[str, Deferred[TaskResult]] = field(default_factory=dict)
-    sent: int | None = None
+    earliest_sent: int | None = None
+    forwarded: bool = False
 
     @property
-    def dating(self) -> OrderAge:
-        """How old it is."""
-        return OrderAge(self.order, self.sent)
+    def age(self) -> OrderAge:
+        return OrderAge(self.order, self.earliest_sent)
 
     def actor(self, robot: RobotState) -> Actor:
-        """Who gives it, as the record of control of a robot knows him."""
-        if _is_local(self.asker):
+        """The user, as a robot's audit entries name them."""
+        if _is_local(self.principal):
             return Actor(LOCAL.name, "cli", address=self.address)
-        name = robot.name_of(self.asker.name, self.asker.realm)
-        return Actor(name, f"user:{name}", self.asker.user_id, self.address)
+        name = robot.name_of(self.principal.name, self.principal.realm)
+        return user_actor(name, self.principal.user_id, self.address)
 
-    def told(self) -> dict[str, Any]:
-        """The first line of the answer."""
-        head = {"do": self.order.do, "robots": list(self.robots), "unmatched": self.unmatched}
-        return {**head, "missed": self.missed} if self.missed else head
+    @property
+    def start(self) -> FleetOrderStart:
+        """The first line of the HTTP response."""
+        return FleetOrderStart(self.order.do, list(self.robots), self.unmatched, self.missed)
 
 
 class FleetService:
-    """Has orders carried out.
+    """Plans orders and carries them out.
 
+    :param forwarding: sends orders to robots that are at other relays
     :param clock_ns: monotonic nanoseconds
     :param wall: Unix time in seconds
     """
@@ -126,158 +135,193 @@ class FleetService:
     def __init__(
         self,
         clock: Clock,
-        front: SessionManager,
+        sessions: SessionManager,
         access: Access,
         registry: RobotRegistry,
-        desks: Controllers,
+        control: ControlService,
         store: AsyncDatabase,
-        journal: EventBus,
+        bus: EventBus,
         audit: AuditLog,
+        modules: ModuleService,
         *,
+        forwarding: OrderForwarding,
         clock_ns: Callable[[], int] = now_ns,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._clock = clock
-        self._front = front
+        self._sessions = sessions
         self._access = access
         self._registry = registry
-        self._halting = FleetStop(desks, registry)
+        self._control = control
+        self._fleet_stop = FleetStop(control, registry)
+        self._modules = modules
+        self._forwarding = forwarding
         self._store = store
-        self._journal = journal
+        self._bus = bus
         self._audit = audit
         self._clock_ns = clock_ns
         self._wall = wall
         self._orders: Counter[int] = Counter()
-        self._stops = Buckets(STOPS_A_SECOND, STOPS_AT_ONCE, STOP_USERS, clock.seconds)
+        self._stops = Buckets(STOPS_PER_SECOND, STOPS_BURST, STOP_USERS, clock.seconds)
 
-    async def groups(self, asker: Principal) -> list[dict[str, Any]]:
-        """Groups of robots, with those the asker has a right on; the others are not told of."""
-        mine = {each.name for each in await self._mine(asker)}
-        groups = await self._store.read(queries.list_robot_groups, asker.realm)
-        told = (
-            {"name": each.name, "robots": [name for name in each.robots if name in mine]} for each in groups
+    async def groups(self, principal: Principal) -> list[RobotGroupInfo]:
+        """Groups of robots, with those robots that the user has a right on; groups without any are left out."""
+        mine = {each.name for each in await self._robots_of(principal)}
+        groups = await self._store.read(queries.list_robot_groups, principal.realm)
+        seen = (
+            RobotGroupInfo(name=each.name, robots=[name for name in each.robots if name in mine])
+            for each in groups
         )
-        return [each for each in told if each["robots"]]
+        return [each for each in seen if each["robots"]]
 
-    async def plan(self, asker: Principal, order: Order, address: str, sent: int | None = None) -> FleetPlan:
-        """Find out which robots an order means.
+    async def plan(
+        self,
+        principal: Principal,
+        order: Order,
+        address: str,
+        earliest_sent: int | None = None,
+        *,
+        forwarded: bool = False,
+    ) -> FleetPlan:
+        """Find the robots of an order.
 
-        A stop is on its way to those that are here, and known to be the asker's, before the database is asked for the
-        others; where that does not answer these are all that are meant.
+        A stop is sent at once to robots that are online and known to be the user's, before the database is
+        asked for the others. If the database does not answer, the stop is for these alone.
 
-        :param sent: a moment before which it can't have been given, the relay's monotonic nanoseconds
-        :raises Invalid: the order makes no sense, or means too many
-        :raises NotFound: it means no robot the asker has a right on
-        :raises MomentNeeded: it moves one of them, or lets it move again, and no moment is named
-        :raises TooOld: it moves one of them, and may be too old
+        :param earliest_sent: see :class:`relay_server.sessions.message_age.MessageAge`; ``None``: unknown
+        :raises Invalid: the order makes no sense, or is for too many robots
+        :raises NotFound: it matches no robot that the user has a right on
+        :raises FreshnessTokenRequired: it moves a robot, or lets one move again, and its age is unknown
+        :raises FreshnessTokenExpired: it moves a robot, and may be too old
         :raises Unavailable: the database does not answer
         """
         order.check()
-        told = self._at_once(asker, order, address) if order.do == "stop" else {}
-        mine = {name: robot for name, (robot, _) in told.items()}
+        stopped = self._stop_online(principal, order, address) if order.do == "stop" else {}
+        mine = {name: robot for name, (robot, _) in stopped.items()}
         groups: dict[str, Collection[str]] = {}
         missed = ""
         try:
             looked_up = with_timeout(
-                self._clock, LOOKUP_SECONDS, self._looked_up(asker, order), NOT_LOOKED_UP
+                self._clock, LOOKUP_SECONDS, self._look_up(principal, order), NOT_LOOKED_UP
             )
             others, groups = await looked_up
             mine |= {each.name: each for each in others}
         except Unavailable as error:
-            if not told:
+            if not stopped:
                 raise
             missed = str(error)
-            self.log.error("an order to stop goes to those that are here alone: {reason}", reason=missed)
+            self.log.error("an order to stop reaches only robots that are online: {reason}", reason=missed)
         found = select_robots(order.robots, mine, groups)
         if not found.robots:
-            raise NotFound("the order means no robot that you have a right on")
-        if order.do != "stop" and len(found.robots) > ROBOTS:
-            raise Invalid(f"the order means {len(found.robots)} robots; it may mean {ROBOTS} at most")
+            raise NotFound("the order matches no robot that you have a right on")
+        if order.do != "stop" and len(found.robots) > MAX_ROBOTS:
+            raise Invalid(f"the order is for {len(found.robots)} robots; it may be for {MAX_ROBOTS} at most")
         robots = {name: mine[name] for name in found.robots}
         known = (self._registry.find(each.id) for each in robots.values())
-        OrderAge(order, sent).check([robot for robot in known if robot is not None], self._clock_ns())
-        stopping = {name: stopping for name, (_, stopping) in told.items()}
-        return FleetPlan(order, asker, address, robots, found.unmatched, missed, stopping, sent)
+        OrderAge(order, earliest_sent).check(
+            [robot for robot in known if robot is not None], self._clock_ns()
+        )
+        stopping = {name: stopping for name, (_, stopping) in stopped.items()}
+        return FleetPlan(
+            order,
+            principal,
+            address,
+            robots,
+            found.unmatched,
+            missed,
+            stopping,
+            earliest_sent,
+            forwarded,
+        )
 
-    def _at_once(
-        self, asker: Principal, order: Order, address: str
+    def _stop_online(
+        self, principal: Principal, order: Order, address: str
     ) -> dict[str, tuple[RobotRecord, Deferred[TaskResult]]]:
-        """Stop what an order means by names and patterns, is here, and is known to be the asker's."""
+        """Stop the robots that match by name or pattern, are online, and are known to be the user's."""
         here = {
             each.name: RobotRecord(each.robot_id, each.name, each.realm, "")
             for each in self._registry
-            if each.control is not None
-            and asker.realm in each.realms
-            and (_is_local(asker) or self._access.knows(asker, each.robot_id))
+            if each.control_link is not None and self._may_stop_at_once(principal, each)
         }
         robots = {name: here[name] for name in select_robots(order.robots, here, {}).robots}
-        plan = FleetPlan(order, asker, address, robots, [])
+        plan = FleetPlan(order, principal, address, robots, [])
         return {
-            name: (robot, Deferred.fromCoroutine(self._one(plan, robot))) for name, robot in robots.items()
+            name: (robot, Deferred.fromCoroutine(self._run_one(plan, robot)))
+            for name, robot in robots.items()
         }
 
-    async def _looked_up(
-        self, asker: Principal, order: Order
+    def _may_stop_at_once(self, principal: Principal, robot: RobotState) -> bool:
+        if _is_local(principal):
+            return principal.realm in robot.realms
+        return self._access.may_stop_at_once(principal, robot)
+
+    async def _look_up(
+        self, principal: Principal, order: Order
     ) -> tuple[list[RobotRecord], dict[str, Collection[str]]]:
-        robots = await self._mine(asker)
+        robots = await self._robots_of(principal)
         if not any(each.startswith(GROUP) for each in order.robots):
             return robots, {}
-        groups = await self._store.read(queries.list_robot_groups, asker.realm)
+        groups = await self._store.read(queries.list_robot_groups, principal.realm)
         return robots, {each.name: each.robots for each in groups}
 
     async def carry_out(
-        self, plan: FleetPlan, begin: Callable[[], None], tell: Callable[[TaskResult], Awaitable[None]]
+        self,
+        plan: FleetPlan,
+        on_begin: Callable[[], None],
+        on_result: Callable[[TaskResult], Awaitable[None]],
     ) -> None:
-        """Do it on all robots, some at a time. Who waits for this and gives up ends it.
+        """Carry out an order on all robots, some at a time. Cancelling the caller ends it.
 
-        :param begin: called when it begins
-        :param tell: is given each result; the next robot has its turn when it has taken that
-        :raises Unavailable: the asker has too many orders under way, or it can't be put on record
+        :param on_begin: called when it begins
+        :param on_result: gets each result; the next robot's turn comes when it is done with it
+        :raises Unavailable: the user has too many orders in progress, or the audit entry cannot be written
         """
         counted: Counter[bool] = Counter()
 
         async def one(name: str) -> None:
-            told = plan.stopping.get(name)
-            result = await (self._one(plan, plan.robots[name]) if told is None else told)
+            stopping = plan.stopping.get(name)
+            result = await (self._run_one(plan, plan.robots[name]) if stopping is None else stopping)
             counted[result.outcome.ok] += 1
-            await tell(result)
+            await on_result(result)
 
         async def begun(doing: Awaitable[None]) -> None:
             try:
                 await doing
             finally:
-                self._tell_of_end(plan, counted)
+                self._publish_end(plan, counted)
 
         if plan.order.do == "stop":
-            begin()
+            on_begin()
             await begun(self._stop(plan, one))
             return
-        with self._place(plan.asker):
-            await self._record(plan)
-            begin()
+        with self._order_slot(plan.principal):
+            await self._write_audit(plan)
+            on_begin()
             await begun(bounded_gather(plan.robots, one))
 
     async def _stop(self, plan: FleetPlan, one: Callable[[str], Awaitable[None]]) -> None:
-        """Nothing is as urgent: whoever can be told is told at once, and only then it is put on record."""
-        told = [
-            name for name, each in plan.robots.items() if name in plan.stopping or self._halting.online(each)
+        """Robots that are online are stopped at once, and only then is the audit entry written."""
+        online = [
+            name
+            for name, each in plan.robots.items()
+            if name in plan.stopping or self._fleet_stop.online(each)
         ]
-        # These by the rights of this moment, which the plan has just looked up; the others are judged in their turn.
-        stopping = Deferred.fromCoroutine(bounded_gather(told, one, at_once=len(told)))
+        # The plan has just looked up the rights on these. The others are judged when their turn comes.
+        stopping = Deferred.fromCoroutine(bounded_gather(online, one, at_once=len(online)))
         try:
-            if self._stops.take(plan.asker.user_id):
-                self._audit.append(self._entry(plan))
+            if self._stops.take(plan.principal.user_id):
+                self._audit.append(self._audit_entry(plan))
         finally:
-            # Who has hung up by now has had them told all the same.
+            # The stops are finished even if the client has hung up.
             await stopping
-        await bounded_gather([name for name in plan.robots if name not in set(told)], one)
+        await bounded_gather([name for name in plan.robots if name not in set(online)], one)
 
-    async def _one(self, plan: FleetPlan, robot: RobotRecord) -> TaskResult:
+    async def _run_one(self, plan: FleetPlan, robot: RobotRecord) -> TaskResult:
         began = self._clock.seconds()
-        running = Deferred.fromCoroutine(self._done(plan, robot))
+        running = Deferred.fromCoroutine(self._dispatch(plan, robot))
         order = plan.order
-        seconds = STOP_SECONDS if order.do in ("stop", "resume") else order.timeout
-        running.addTimeout(seconds, as_twisted(self._clock), _too_late(order.do))
+        seconds = STOP_OR_RESUME_SECONDS if order.do in ("stop", "resume") else order.timeout
+        running.addTimeout(seconds, as_twisted(self._clock), _timeout_error(order.do))
         try:
             outcome = await running
         except SwitchboardError as error:
@@ -287,82 +331,104 @@ class FleetService:
             raise
         except Exception:
             self.log.failure("an order failed on {robot}", robot=robot.full)
-            outcome = TaskOutcome(False, "the relay failed on this order; its log tells more")
+            outcome = TaskOutcome(False, "the relay failed on this order; see its log")
         return TaskResult(robot.name, outcome, self._clock.seconds() - began)
 
-    async def _done(self, plan: FleetPlan, robot: RobotRecord) -> TaskOutcome:
+    async def _dispatch(self, plan: FleetPlan, robot: RobotRecord) -> TaskOutcome:
         order = plan.order
-        if order.do == "stop" and self._halting.online(robot):
-            return await self._halting.stop(robot, plan.actor(self._there(robot)), order.why)
+        if order.do != "stop" and not plan.forwarded:
+            outcome = await self._forwarding.send(plan.principal, plan.address, order, robot)
+            if outcome is not None:
+                return outcome
+        if order.do == "stop" and self._fleet_stop.online(robot):
+            return await self._fleet_stop.stop(
+                robot, plan.actor(self._state_of(robot)), order.why, order.stop_id
+            )
         if order.do in ("stop", "resume"):
-            return await self._halted(plan, robot)
-        return await self._errand(plan, robot)
+            return await self._stop_or_resume(plan, robot)
+        return await self._run_task(plan, robot)
 
-    async def _halted(self, plan: FleetPlan, record: RobotRecord) -> TaskOutcome:
-        """Stop a robot or let it move again, by the asker's rights as they stand when its turn comes."""
-        order, halting, actor = plan.order, self._halting, plan.actor(self._there(record))
+    async def _stop_or_resume(self, plan: FleetPlan, record: RobotRecord) -> TaskOutcome:
+        """Stop a robot or let it move again, by the user's rights when its turn comes."""
+        order, stopping, actor = plan.order, self._fleet_stop, plan.actor(self._state_of(record))
         try:
             admission = await self._admit(plan, record)
         except Unavailable:
             if order.do != "stop":
                 raise
-            # Nobody can say that he may not, and the plan says that he may.
-            return await halting.stop(record, actor, order.why)
+            # The rights cannot be looked up now; the plan has found that the user may.
+            return await stopping.stop(record, actor, order.why, order.stop_id)
         try:
             if order.do == "stop":
-                return await halting.stop(record, actor, order.why)
-            return await halting.resume(record, admission.permit, actor, order.why, plan.dating.since)
+                return await stopping.stop(record, actor, order.why, order.stop_id)
+            return await stopping.resume(record, admission.permit, actor, order.why, plan.age.earliest_sent)
         finally:
-            self._front.turn_away(admission)
+            self._sessions.release(admission)
 
-    async def _errand(self, plan: FleetPlan, record: RobotRecord) -> TaskOutcome:
+    async def _run_task(self, plan: FleetPlan, record: RobotRecord) -> TaskOutcome:
         admission = await self._admit(plan, record)
-        if not self._front.accepting:
-            self._front.turn_away(admission)
+        if not self._sessions.accepting:
+            self._sessions.release(admission)
             raise ShuttingDown("the relay is going down")
-        # However late its turn comes, it is as old as it is.
-        client = LoopbackClient(undated=plan.dating.since)
-        session = self._front.open(admission, client, self._clock_ns())
+        if plan.order.do == "module":
+            try:
+                return await self._order_module(plan, admission)
+            finally:
+                self._sessions.release(admission)
+        # Commands are as old as the order, however late the robot's turn comes.
+        port = InProcessPort(undated=plan.age.earliest_sent)
+        session = self._sessions.open_in_process(admission, port)
 
-        def young() -> None:
-            plan.dating.check_turn(session.robot, self._clock_ns())
+        def check_age() -> None:
+            plan.age.check_turn(admission.robot, self._clock_ns())
 
         try:
-            client.begin(session)
-            return await FleetTask(self._clock, session, client, plan.order, young).run()
+            port.begin(session)
+            return await FleetTask(self._clock, self._control, port, plan.order, check_age).run()
         finally:
             session.end(orderly=True)
 
-    async def _admit(self, plan: FleetPlan, record: RobotRecord) -> AuthorizedSession:
-        if not _is_local(plan.asker):
-            return await self._front.admit(plan.asker, record.name, plan.address)
-        return AuthorizedSession(Permit(LOCAL, record.id, OWNS), self._there(record), plan.address)
+    async def _order_module(self, plan: FleetPlan, admission: Admission) -> TaskOutcome:
+        order, robot = plan.order, admission.robot
+        actor = plan.actor(robot)
+        user = user_of(robot, admission.permit, plan.address)._replace(actor=actor.source, user_id=actor.user)
+        done = await self._modules.order(user, order.module, action_of(order.action), limited=False)
+        if done.pending:
+            return TaskOutcome(
+                True, f"{done.why}; the {order.action} is pending until it answers or is back", pending=True
+            )
+        return TaskOutcome(True)
 
-    def _there(self, record: RobotRecord) -> RobotState:
-        return self._registry.presence(record.id, record.name, record.realm)
+    async def _admit(self, plan: FleetPlan, record: RobotRecord) -> Admission:
+        if not _is_local(plan.principal):
+            return await self._sessions.admit(plan.principal, record.name, plan.address)
+        return Admission(Permit(LOCAL, record.id, LOCAL_RULES), self._state_of(record), plan.address)
 
-    async def _mine(self, asker: Principal) -> list[RobotRecord]:
-        if _is_local(asker):
-            return await self._store.read(queries.list_robots, asker.realm)
-        return [record for record, _ in await self._access.robots(asker)]
+    def _state_of(self, record: RobotRecord) -> RobotState:
+        return self._registry.robot(record.id, record.name, record.realm)
+
+    async def _robots_of(self, principal: Principal) -> list[RobotRecord]:
+        if _is_local(principal):
+            return await self._store.read(queries.list_robots, principal.realm)
+        return [record for record, _ in await self._access.robots(principal)]
 
     @contextmanager
-    def _place(self, asker: Principal) -> Iterator[None]:
-        if self._orders[asker.user_id] >= ORDERS:
-            raise Unavailable(f"{ORDERS} orders of yours are under way already; wait until one is done")
-        self._orders[asker.user_id] += 1
+    def _order_slot(self, principal: Principal) -> Iterator[None]:
+        if self._orders[principal.user_id] >= MAX_ORDERS:
+            raise Unavailable(f"you have {MAX_ORDERS} orders in progress; wait until one is done")
+        self._orders[principal.user_id] += 1
         try:
             yield
         finally:
-            self._orders[asker.user_id] -= 1
+            self._orders[principal.user_id] -= 1
             self._orders += Counter()
 
-    async def _record(self, plan: FleetPlan) -> None:
-        """Put on record what is ordered, before it is done.
+    async def _write_audit(self, plan: FleetPlan) -> None:
+        """Write the audit entry before the order is carried out.
 
-        :raises Unavailable: it can't be
+        :raises Unavailable: it cannot be written
         """
-        entry = self._entry(plan)
+        entry = self._audit_entry(plan)
         await self._store.write(
             queries.append_audit,
             at=entry.at,
@@ -373,26 +439,26 @@ class FleetService:
             data=entry.data,
         )
 
-    def _entry(self, plan: FleetPlan) -> AuditLogEntry:
-        """What the audit log says of an order; never what services are given, which may be secret."""
+    def _audit_entry(self, plan: FleetPlan) -> AuditLogEntry:
+        """The audit entry of an order. Arguments of services are left out, since they may be secret."""
         order = plan.order
         return AuditLogEntry(
             self._wall(),
-            plan.asker.name if _is_local(plan.asker) else f"user:{plan.asker.full}",
+            plan.principal.name if _is_local(plan.principal) else f"user:{plan.principal.full}",
             f"fleet.{order.do}",
-            ", ".join(full_name(each, plan.asker.realm) for each in order.robots),
+            ", ".join(full_name(each, plan.principal.realm) for each in order.robots),
             plan.address,
             {"robots": len(plan.robots), "what": order.subject, "why": order.why},
             tuple(each.id for each in plan.robots.values()),
         )
 
-    def _tell_of_end(self, plan: FleetPlan, counted: Counter[bool]) -> None:
-        asker = plan.asker
-        self._journal.event(
+    def _publish_end(self, plan: FleetPlan, counted: Counter[bool]) -> None:
+        principal = plan.principal
+        self._bus.publish(
             "fleet.done",
-            f"user:{asker.name}",
-            cause=f"fleet:{asker.full}",
-            user_id=asker.user_id,
+            source=f"user:{principal.name}",
+            # The command line knows all realms, so no realm's administrators are notified of its orders.
+            realm=None if _is_local(principal) else principal.realm,
             what=f"{plan.order.do} {plan.order.subject}".strip(),
             robots=len(plan.robots),
             ok=counted[True],
@@ -400,16 +466,16 @@ class FleetService:
         )
 
 
-def _too_late(do: str) -> Callable[[Any, float], Any]:
-    """What is told of an order of this kind that has taken too long."""
+def _timeout_error(do: str) -> Callable[[Any, float], Any]:
+    """Makes the error of an order of this kind that took too long."""
 
-    def told(result: Any, seconds: float) -> Any:
+    def to_error(result: Any, seconds: float) -> Any:
         if not isinstance(result, Failure):
             return result
         result.trap(CancelledError)
         if do == "publish":
-            raise Unavailable(f"it was not done within {seconds:g} s")
-        # The robot may have it: nothing takes it back.
+            raise Unavailable(f"not done within {seconds:g} s")
+        # The robot may have received it, and nothing takes it back.
         raise Unavailable(f"no answer within {seconds:g} s; it may still happen")
 
-    return told
+    return to_error

@@ -1,114 +1,151 @@
-"""An order on one robot: done by a session of the asker's, and told in words."""
+"""An order on one robot: carried out by a session of the user, except for stops and resumes, which need none."""
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 
-import msgspec
-
-from relay_protocol import jsontext
+from relay_db.queries import RobotRecord
 from relay_protocol.errors import Refused, SwitchboardError
-from relay_server.channels.robot_link import resolve
+from relay_server.access import Permit
+from relay_server.channels.names import resolve
 from relay_server.common.clock import Clock
-from relay_server.fleet.order import Order, moves
-from relay_server.fleet.result import TaskOutcome
-from relay_server.http_sessions.loopback_client import LoopbackClient
-from relay_server.http_sessions.one_shot_publisher import OneShotPublisher, may_move, type_of
-from relay_server.sessions.session import Session
+from relay_server.control.actor import Actor
+from relay_server.control.service import ControlService
+from relay_server.fleet.order import Order, TaskOutcome, moves
+from relay_server.in_process_sessions.in_process_port import InProcessPort
+from relay_server.in_process_sessions.one_shot_publisher import OneShotPublisher, may_move, type_of
+from relay_server.robots.registry import RobotRegistry, RobotState
 
 
 class FleetTask:
-    """What is to be done on one robot.
+    """An order on one robot.
 
-    :param young: sees that it moves the robot in time, and raises else
+    :param check_age: raises when the order is too old to move the robot
     """
 
     def __init__(
-        self, clock: Clock, session: Session, client: LoopbackClient, order: Order, young: Callable[[], None]
+        self,
+        clock: Clock,
+        control: ControlService,
+        port: InProcessPort,
+        order: Order,
+        check_age: Callable[[], None],
     ) -> None:
         self._clock = clock
-        self._young = young
-        self._session = session
-        self._client = client
+        self._control = control
+        self._check_age = check_age
+        self._client = port.client
+        self._port = port
         self._order = order
 
     async def run(self) -> TaskOutcome:
-        """Do it. What goes wrong is told in the outcome."""
+        """Carry it out. Errors become the outcome."""
         try:
-            if moves(self._session.robot, self._order):
-                self._young()
-            return await _WAYS[self._order.do](self)
+            if moves(self._client.robot, self._order):
+                self._check_age()
+            return await _METHODS[self._order.do](self)
         except SwitchboardError as error:
             return TaskOutcome(False, str(error))
 
     async def call(self) -> TaskOutcome:
-        """Call a service; one that moves the robot with control of it."""
-        order, motion = self._order, self._session.robot.description.motion
+        """Call a service; if it moves the robot, with control of it."""
+        order, motion = self._order, self._client.robot.description.motion
         if not motion.moves_by_service(resolve(order.service)):
             return await self._call()
         await self._take_control()
         try:
-            self._young()
+            self._check_age()
             return await self._call()
         finally:
-            self._session.desk.release(self._session, "the order is done")
+            self._control.release(self._client, "the order is done")
 
     async def _call(self) -> TaskOutcome:
         order = self._order
-        answer = await self._client.call(order.service, order.args, order.type, order.timeout)
+        answer = await self._port.call(order.service, order.args, order.type, order.timeout)
         said = answer.read
-        return TaskOutcome.of_service(said) if answer.result else TaskOutcome(False, str(said))
+        return TaskOutcome.from_service(said) if answer.result else TaskOutcome(False, str(said))
 
     async def publish(self) -> TaskOutcome:
-        """Publish one message, once the robot can and somebody listens.
+        """Publish one message, once the robot can and a subscriber exists.
 
         :raises Refused: the topic counts as motion
-        :raises NotFound: nobody knows the topic's type
+        :raises NotFound: the topic's type is not known
         :raises Unavailable: the robot is offline
         """
-        order, session = self._order, self._session
+        order, client = self._order, self._client
         topic = resolve(order.topic)
-        type_name = type_of(session, topic, order.type)
-        if may_move(session, topic, type_name):
-            name = session.robot.name
+        type_name = type_of(client, topic, order.type)
+        if may_move(client, topic, type_name):
+            name = client.robot.name
             raise Refused(
-                f"{topic} counts as motion on {name}: one message moves no robot; call a service, or drive it"
+                f"{topic} counts as motion on {name}, and one message moves no robot; call a service, or drive it"
             )
-        await OneShotPublisher(self._clock, self._client, session, topic).say(order.msg, type_name)
+        await OneShotPublisher(self._clock, self._port, topic).publish(order.msg, type_name)
         return TaskOutcome(True)
 
     async def set(self) -> TaskOutcome:
         """Set a parameter of a node."""
         args = {"name": self._order.name, "value": bytes(self._order.value).decode()}
-        answer = await self._client.call("/rosapi/set_param", msgspec.Raw(jsontext.encode(args)))
-        said = answer.read
-        if not answer.result:
-            return TaskOutcome(False, str(said))
-        return TaskOutcome(bool(said["successful"]), str(said["reason"]))
+        answer = await self._port.call_own("/rosapi/set_param", args)
+        return TaskOutcome(bool(answer["successful"]), str(answer["reason"]))
 
     async def _take_control(self) -> None:
-        """:raises Refused: somebody else has it, or the asker may not
-        :raises Unavailable: the robot is offline, or does not agree
+        """:raises Refused: another user has control, or the user may not have it
+        :raises Unavailable: the robot is offline, or does not confirm
         """
-        session = self._session
-        desk, lease = session.desk, session.desk.lease
-        has_it = lease.holder or lease.coming
-        if has_it is not None and has_it.client is not session:
-            if has_it.client.user == session.user:
-                name = session.robot.name
-                raise Refused(
-                    f"you have control of {name} yourself, by another connection: give it back there first"
-                )
-            # Only asked for, it would be taken from who has it some time later, when nobody expects that any more.
-            raise Refused(f"{has_it.client.name} has control of {session.robot.name}")
-        answer = await desk.take(session, self._order.why or "an order to many robots")
+        client = self._client
+        lease = client.controller.lease
+        has_it = lease.holder or lease.pending_holder
+        if has_it is not None and has_it.client is not client:
+            if has_it.client.user == client.user:
+                name = client.robot.name
+                raise Refused(f"another connection of yours has control of {name}: release it there first")
+            # A request would take control some time later, when the user no longer expects it.
+            raise Refused(f"{has_it.client.name} has control of {client.robot.name}")
+        answer = await self._control.take(client, self._order.why or "an order to many robots")
         if not answer.success:
-            desk.release(session, "the order does not wait")
+            self._control.release(client, "the order does not wait")
             raise Refused(answer.message)
 
 
-_WAYS: dict[str, Callable[[FleetTask], Awaitable[TaskOutcome]]] = {
+_METHODS: dict[str, Callable[[FleetTask], Awaitable[TaskOutcome]]] = {
     "call": FleetTask.call,
     "publish": FleetTask.publish,
     "set": FleetTask.set,
 }
+
+
+class FleetStop:
+    """Stops and resumes one robot of an order."""
+
+    def __init__(self, control: ControlService, registry: RobotRegistry) -> None:
+        self._control = control
+        self._registry = registry
+
+    def online(self, record: RobotRecord) -> bool:
+        """Whether the robot can be reached now."""
+        robot = self._registry.find(record.id)
+        return robot is not None and robot.control_link is not None
+
+    async def stop(self, record: RobotRecord, actor: Actor, why: str, stop_id: str) -> TaskOutcome:
+        """Stop a robot: the command is on its way before anything is waited for.
+
+        :raises Unavailable: as of :meth:`ControlService.stop`
+        """
+        result = await self._control.stop(self._robot(record), actor, why, stop_id)
+        if result.done:
+            return TaskOutcome(True)
+        return TaskOutcome(not result.failed, result.sentence(record.name), pending=not result.failed)
+
+    async def resume(
+        self, record: RobotRecord, permit: Permit, actor: Actor, why: str, earliest_sent: int
+    ) -> TaskOutcome:
+        """See :meth:`ControlService.resume`.
+
+        :param permit: of the caller
+        """
+        await self._control.resume(self._robot(record), permit, actor, why, earliest_sent)
+        return TaskOutcome(True)
+
+    def _robot(self, record: RobotRecord) -> RobotState:
+        return self._registry.robot(record.id, record.name, record.realm)

@@ -1,1 +1,1 @@
-"""The HTTP framework: limits, errors, conditional requests, forms, OpenAPI, RDF, the site."""
+"""The HTTP framework: site, endpoints, limits, errors, conditional requests, media types, OpenAPI, RDF."""

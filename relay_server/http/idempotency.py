@@ -1,7 +1,7 @@
-"""The same request twice is done once (draft-ietf-httpapi-idempotency-key-header): by a key that its sender makes up.
+"""Idempotency keys (draft-ietf-httpapi-idempotency-key-header): a request that is sent twice is carried out once.
 
-A client that has got no answer does not know whether what it asked for was done. Sent again with the same key, it is
-given the answer of the first time, or waits for it.
+A client without an answer cannot know whether its request was carried out. If it sends the request again with the same
+key, it gets the first answer, or waits for it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from twisted.python.failure import Failure
 from relay_protocol.errors import Invalid, NotFound, PeerError, Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import MIB
 from relay_server.common.clock import Clock, Timer, cancel
+from relay_server.http.endpoint import ApiRequest
 from relay_server.resources.goals import GoalOwner
 
 KEY_HEADER = "idempotency-key"
@@ -26,30 +27,30 @@ KEY = 255
 """Longest key, characters."""
 
 KEPT_SECONDS = 600.0
-"""An answer is kept for so long."""
+"""Seconds for which an answer is kept."""
 
 KEYS = 256
 ANSWERS_BYTES = 4 * MIB
-"""Of one user: the answers that are longest known go first, the newest stays."""
+"""Most keys, and most bytes of answers, of one user. The oldest answers go first; the newest stays."""
 
 NOTHING_DONE = (Refused, Invalid, NotFound, PeerError, Unavailable)
-"""What was answered so may be tried again with the same key."""
+"""Errors after which the same key may be used again: nothing was carried out."""
 
 _QUOTED = re.compile(r'"((?:[ !#-\[\]-~]|\\["\\])*)"')
 _PLAIN = re.compile(r"[!-~]+")
 
 
 class KeyReused(Refused):
-    """A key that stands for another request."""
+    """The key was used for another request."""
 
     code = "key_reused"
 
 
 class StoredReply(NamedTuple):
-    """What was answered.
+    """A stored answer.
 
     :param body: JSON; empty for none
-    :param location: where to go on, or empty
+    :param location: the ``Location`` header, or empty
     """
 
     status: int
@@ -58,9 +59,9 @@ class StoredReply(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What a key is for: it means nothing anywhere else.
+    """The scope of a key: the same key at another address is another key.
 
-    :param address: what is asked, of the robot
+    :param address: path of the request
     """
 
     owner: GoalOwner
@@ -70,10 +71,10 @@ class Target(NamedTuple):
 
 
 def key_in(values: list[str]) -> str | None:
-    """The key of a request: a string of RFC 9651 section 3.3.3, in quotes; without them as it is.
+    """The key of a request: a quoted string of RFC 9651 section 3.3.3, or a text without quotes.
 
     :param values: of all header fields of that name
-    :raises Invalid: more than one, or none that can be
+    :raises Invalid: there are several, or the key is not valid
     """
     if not values:
         return None
@@ -81,14 +82,14 @@ def key_in(values: list[str]) -> str | None:
     quoted = _QUOTED.fullmatch(text)
     key = re.sub(r"\\(.)", r"\1", quoted[1]) if quoted else text
     if len(values) > 1 or not key or not (quoted or (_PLAIN.fullmatch(text) and not text.startswith('"'))):
-        raise Invalid(f"'{KEY_HEADER}' must be there once, and be a string of printable ASCII characters")
+        raise Invalid(f"'{KEY_HEADER}' must be sent once, as a string of printable ASCII characters")
     if len(key) > KEY:
-        raise Invalid(f"'{KEY_HEADER}' may have {KEY} characters at most")
+        raise Invalid(f"'{KEY_HEADER}' may have at most {KEY} characters, not {len(key)}")
     return key
 
 
 class _Known:
-    """One request: under way, or answered."""
+    """One request that is running or answered."""
 
     def __init__(self, digest: bytes) -> None:
         self.digest = digest
@@ -98,19 +99,19 @@ class _Known:
 
     @property
     def size(self) -> int:
-        """Bytes that are kept of it."""
+        """Bytes of the stored answer."""
         return len(self.outcome.body) if isinstance(self.outcome, StoredReply) else 0
 
     def reply(self) -> Deferred[StoredReply]:
-        """What it is answered, when it is; who gives up waiting ends nothing."""
+        """The answer, now or later. Cancelling the deferred does not end the request."""
         waiting: Deferred[StoredReply] = Deferred(self._given_up)
         self.waiting.append(waiting)
         if self.outcome is not None:
-            self.tell()
+            self.answer_all()
         return waiting
 
-    def tell(self) -> None:
-        """Tell all who wait."""
+    def answer_all(self) -> None:
+        """Give the answer to all that wait for it."""
         waiting, self.waiting = self.waiting, []
         for each in waiting:
             if isinstance(self.outcome, BaseException):
@@ -123,14 +124,14 @@ class _Known:
 
 
 class Idempotency:
-    """Requests that were sent with a key, and what they were answered."""
+    """Requests that were sent with a key, and their answers."""
 
     log = Logger()
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._of: dict[int, dict[Target, _Known]] = {}
-        """By user; those that are answered behind those that are under way, in the order of their answers."""
+        """By user: first the running requests, then the answered ones in the order of their answers."""
 
     async def once(
         self,
@@ -139,20 +140,20 @@ class Idempotency:
         work: Callable[[], Coroutine[Deferred[Any], Any, StoredReply]],
         may: Callable[[], Coroutine[Deferred[Any], Any, None]],
     ) -> StoredReply:
-        """Do something unless it was done already. It is done to its end, also when who asked for it has left.
+        """Carry out a request unless that was done already. It completes even if the sender disconnects.
 
-        :param body: of the request; another one is another request
-        :param may: raises what keeps the asker from being given the answer of an earlier request
-        :raises KeyReused: the key stands for a request with another body
-        :raises Unavailable: too many requests of the user are under way
-        :raises SwitchboardError: as ``work`` did
+        :param body: body of the request
+        :param may: raises an error if the sender may not get the answer of the earlier request
+        :raises KeyReused: the key was used with another body
+        :raises Unavailable: too many requests of the user are running
+        :raises SwitchboardError: as ``work``
         """
         digest = hashlib.sha256(body).digest()
         known = self._of.get(target.owner.user, {}).get(target)
         if known is None:
             known = self._begin(target, digest, work)
         elif known.digest != digest:
-            raise KeyReused(f"this '{KEY_HEADER}' was sent with another body; make up a new one")
+            raise KeyReused(f"this '{KEY_HEADER}' was sent with another body; use a new key")
         else:
             await may()
         return await known.reply()
@@ -165,7 +166,9 @@ class Idempotency:
     ) -> _Known:
         mine = self._of.get(target.owner.user, {})
         if sum(each.outcome is None for each in mine.values()) >= KEYS:
-            raise Unavailable(f"{KEYS} requests of yours with an '{KEY_HEADER}' are under way already")
+            raise Unavailable(
+                f"{KEYS} of your requests with an '{KEY_HEADER}' are running already; wait until one has ended"
+            )
         known = _Known(digest)
         self._of.setdefault(target.owner.user, {})[target] = known
         running = Deferred.fromCoroutine(work())
@@ -176,13 +179,13 @@ class Idempotency:
         known.outcome = outcome.value if isinstance(outcome, Failure) else outcome
         self._remove(target)
         if isinstance(outcome, Failure) and not known.waiting and not outcome.check(SwitchboardError):
-            self.log.failure("what nobody waits for any more has failed", outcome)
+            self.log.failure("a request failed after its sender had disconnected", outcome)
         if not isinstance(known.outcome, NOTHING_DONE):
             mine = self._of.setdefault(target.owner.user, {})
             mine[target] = known
             known.forgetting = self._clock.callLater(KEPT_SECONDS, self._remove, target)
             self._see_room(mine)
-        known.tell()
+        known.answer_all()
 
     def _see_room(self, mine: dict[Target, _Known]) -> None:
         answered = [target for target, known in mine.items() if known.outcome is not None]
@@ -200,3 +203,24 @@ class Idempotency:
             cancel(known.forgetting)
         if not mine:
             self._of.pop(target.owner.user, None)
+
+
+async def once(
+    memory: Idempotency,
+    request: ApiRequest,
+    robot: str,
+    work: Callable[[], Coroutine[Deferred[Any], Any, StoredReply]],
+    may: Callable[[], Coroutine[Deferred[Any], Any, None]],
+) -> StoredReply:
+    """Carry out a request, unless that was already done for the same key.
+
+    :param robot: robot of the path, or empty
+    :param may: raises an error if the sender may not get the answer of the earlier request
+    :raises SwitchboardError: as ``work``; also for an invalid key, or one of a different request
+    """
+    key = key_in(request.http.requestHeaders.getRawHeaders(KEY_HEADER, []))
+    if key is None:
+        return await work()
+    address = request.http.path.decode("ascii", "replace")
+    target = Target(GoalOwner.of(request.principal), robot, address, key)
+    return await memory.once(target, request.content(), work, may)

@@ -1,4 +1,4 @@
-"""The forms a resource is told in, and which of them a request wants (RFC 9110 sections 12.5.1 and 15.5.7)."""
+"""Media types of resources, and content negotiation (RFC 9110 sections 12.5.1 and 15.5.7)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from relay_protocol.errors import Invalid
 
 
 class MediaType(NamedTuple):
-    """One of them.
+    """One form of a resource.
 
     :param media: its media type
-    :param mark: end of its entity tags, so that those of two forms differ; none for JSON
+    :param mark: end of its entity tags, so that the tags of two forms differ; empty for JSON
     """
 
     media: str
@@ -24,12 +24,12 @@ class MediaType(NamedTuple):
     def tag(self, base: str) -> str:
         """The entity tag of a state in this form.
 
-        :param base: that of its JSON
+        :param base: the entity tag of its JSON
         """
         return f'{base[:-1]}{self.mark}"'
 
     def bases(self, tags: frozenset[str]) -> frozenset[str]:
-        """What tags of this form have as JSON; those of other forms are left out."""
+        """The tags of JSON for tags of this form. Tags of other forms are left out."""
         others = [each.mark for each in FORMS if each.mark and each is not self]
         found = (each[:-1] for each in tags if each.endswith(f'{self.mark}"'))
         return frozenset(
@@ -43,40 +43,41 @@ TURTLE = MediaType("text/turtle", "-ttl")
 JSON_LD = MediaType("application/ld+json", "-ld")
 FORMS = (JSON, RDF_XML, TURTLE, JSON_LD)
 EVENTS = MediaType("text/event-stream")
+MSGPACK = MediaType("application/msgpack")
 
 
 class NotAcceptable(Invalid):
-    """A request takes none of the forms there are."""
+    """The client accepts none of the available forms."""
 
     code = "not_acceptable"
 
     def __init__(self, there: Sequence[MediaType]) -> None:
         self.available = [each.media for each in there]
-        super().__init__(f"this is there as {', '.join(self.available)}; 'Accept' names none of them")
+        super().__init__(f"available are {', '.join(self.available)}; 'Accept' names none of them")
 
 
 class UnsupportedMediaType(Invalid):
-    """A request's body is in a form that is not read."""
+    """The media type of a body is not supported."""
 
     code = "unsupported_media_type"
 
-    def __init__(self) -> None:
-        self.available = [each.media for each in FORMS]
+    def __init__(self, there: Sequence[MediaType]) -> None:
+        self.available = [each.media for each in there]
         super().__init__(f"send the body as {', '.join(self.available)}")
 
 
 def wanted(accept: str | None, there: Sequence[MediaType] = FORMS) -> MediaType:
-    """The form that a request wants most; the first of those it wants alike, but one that it names before others.
+    """The available form that a client prefers. Among equals, one that it names goes before one that it does not.
 
-    :param accept: its ``Accept``
-    :raises NotAcceptable: there is none that it takes
+    :param accept: the ``Accept`` header
+    :raises NotAcceptable: the client accepts none
     """
     if accept is None or not accept.strip():
         return there[0]
-    # No form has parameters: who names some ('charset=utf-8') means the form.
-    asked = [(_bare(name), quality) for name, quality in parse_accept_header(accept, MIMEAccept)]
-    named = {name for name, _ in asked}
-    accepted = MIMEAccept(asked)
+    # No form has parameters, so those that a client sends ('charset=utf-8') are ignored.
+    listed = [(_bare(name), quality) for name, quality in parse_accept_header(accept, MIMEAccept)]
+    named = {name for name, _ in listed}
+    accepted = MIMEAccept(listed)
     best = max(there, key=lambda each: (accepted.quality(each.media), each.media in named))
     if accepted.quality(best.media) <= 0:
         raise NotAcceptable(there)
@@ -84,24 +85,25 @@ def wanted(accept: str | None, there: Sequence[MediaType] = FORMS) -> MediaType:
 
 
 def preferred(accept: str | None, there: Sequence[MediaType]) -> MediaType:
-    """The same where the first is for everybody, whatever he says he takes (RFC 9110 section 12.1)."""
+    """The same, but the first form is sent to a client that accepts none (RFC 9110 section 12.1)."""
     try:
         return wanted(accept, there)
     except NotAcceptable:
         return there[0]
 
 
-def sent(content_type: str | None) -> MediaType:
-    """The form a request's body is in.
+def sent(content_type: str | None, there: Sequence[MediaType] = FORMS) -> MediaType:
+    """The form of a request's body.
 
     :param content_type: its ``Content-Type``
-    :raises UnknownForm: it is none that is read
+    :param there: forms that are read
+    :raises UnsupportedMediaType: the relay does not read this form
     """
     media = _bare(content_type or "")
-    for each in FORMS:
+    for each in there:
         if each.media == media:
             return each
-    raise UnsupportedMediaType
+    raise UnsupportedMediaType(there)
 
 
 def tags_of(header: str | None) -> frozenset[str]:
@@ -110,13 +112,13 @@ def tags_of(header: str | None) -> frozenset[str]:
 
 
 def of_any_form(header: str | None) -> str | None:
-    """``If-Match`` with the tags that the state has as JSON, whichever form they were read in."""
+    """``If-Match`` with the tags of JSON, whichever form the client has read."""
     if header is None:
         return None
     named = parse_etags(header)
     if named.star_tag:
         return header
-    # A weak one is never the same (RFC 9110 section 13.1.1).
+    # Weak tags never match (RFC 9110 section 13.1.1).
     tags = frozenset(f'"{each}"' for each in named.as_set())
     return ", ".join(sorted(frozenset[str]().union(*(each.bases(tags) for each in FORMS)))) or '""'
 

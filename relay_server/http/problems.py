@@ -1,7 +1,8 @@
-"""Errors as problem details (RFC 9457): which status, which words."""
+"""Errors as problem details (RFC 9457): their status, title and headers."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from twisted.web.server import Request
@@ -12,21 +13,36 @@ from relay_protocol.errors import Invalid, MalformedMessage, NotFound, Refused, 
 from relay_server.access import BadCredentials
 from relay_server.alerts.service import TooManyRuleChanges as TooManyRules
 from relay_server.auth.authenticator import TooManyTries
+from relay_server.common.errors import NotDone, NothingReceived
+from relay_server.common.etags import PreconditionFailed
 from relay_server.common.freshness_tokens import FreshnessTokenExpired, FreshnessTokenRequired
-from relay_server.control.commands import NotDone
 from relay_server.control.stopping import StoppedSince
 from relay_server.events.writer import EventQueueFull
 from relay_server.http.idempotency import KeyReused
+from relay_server.http.limits import TooManyRequests, TooManyStreams
 from relay_server.http.media_types import NotAcceptable, UnsupportedMediaType
-from relay_server.http.method_not_allowed import WrongMethod
-from relay_server.http.rate_limits import TooManyRequests, TooManyStreams
-from relay_server.http_sessions.loopback_client import MaybeDone
-from relay_server.realms.realm_change import Needed
+from relay_server.in_process_sessions.in_process_port import MaybeDone
+from relay_server.realms.realm_change import LastAdministrator
 from relay_server.realms.service import TooManyChanges as TooManyOfRealm
-from relay_server.registry.entries import TooLarge
-from relay_server.registry.service import MatchNeeded, TooManyRegistryChanges
-from relay_server.resources.etags import PreconditionFailed
-from relay_server.video.ports import NoFrame, TooManyStreamStarts
+from relay_server.service_registry.entries import TooLarge
+from relay_server.service_registry.service import MatchNeeded, TooManyEntryChanges
+from relay_server.video.errors import TooManyStreamStarts
+
+
+class WrongMethod(SwitchboardError):
+    """The resource does not support this method.
+
+    :ivar allow: the supported methods, as in ``Allow``
+    """
+
+    code = "method_not_allowed"
+
+    def __init__(self, takes: Iterable[str]) -> None:
+        methods = set(takes)
+        # HEAD works wherever GET does.
+        self.allow = ", ".join(sorted(methods | ({"HEAD"} if "GET" in methods else set())))
+        super().__init__(f"this address does not support that method; use {self.allow}")
+
 
 _TITLES = {
     400: "Bad request",
@@ -35,7 +51,7 @@ _TITLES = {
     404: "Not found",
     405: "Method not allowed",
     406: "Not acceptable",
-    409: "Not done",
+    409: "Conflict",
     412: "Precondition failed",
     413: "Too large",
     415: "Unsupported media type",
@@ -46,7 +62,7 @@ _TITLES = {
     429: "Too many requests",
     500: "Internal error",
     503: "Unavailable",
-    504: "Nothing came in time",
+    504: "Timeout",
 }
 
 _STATUS: list[tuple[type[SwitchboardError], int]] = [
@@ -60,9 +76,9 @@ _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (MatchNeeded, 428),
     (AlreadyExists, 409),
     (QuotaExceeded, 409),
-    (TooManyRegistryChanges, 429),
+    (TooManyEntryChanges, 429),
     (TooManyOfRealm, 429),
-    (Needed, 409),
+    (LastAdministrator, 409),
     (TooLarge, 413),
     (FreshnessTokenExpired, 412),
     (StoppedSince, 412),
@@ -75,7 +91,7 @@ _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (MalformedMessage, 400),
     (NotDone, 409),
     (MaybeDone, 409),
-    (NoFrame, 504),
+    (NothingReceived, 504),
     (TooManyStreamStarts, 429),
     (TooManyRules, 429),
     (Unavailable, 503),
@@ -86,15 +102,15 @@ _LATER = (
     TooManyRequests,
     TooManyStreamStarts,
     TooManyRules,
-    TooManyRegistryChanges,
+    TooManyEntryChanges,
     TooManyOfRealm,
     EventQueueFull,
 )
-"""What may be tried again after some time."""
+"""Errors that carry ``Retry-After``."""
 
 
 def problem(request: Request, status: int, detail: str, **more: Any) -> bytes:
-    """An error in words: status and headers are set, the body is returned."""
+    """Set status and headers of an error; returns the body."""
     request.setResponseCode(status)
     request.setHeader(b"content-type", b"application/problem+json")
     request.setHeader(b"cache-control", b"no-store")
@@ -102,7 +118,7 @@ def problem(request: Request, status: int, detail: str, **more: Any) -> bytes:
 
 
 def problem_body(status: int, detail: str, **more: Any) -> bytes:
-    """The body of such an answer."""
+    """The body of an error."""
     title = _TITLES.get(status, "Error")
     return jsontext.encode(
         {"type": "about:blank", "title": title, "status": status, "detail": detail, **more}
@@ -110,15 +126,17 @@ def problem_body(status: int, detail: str, **more: Any) -> bytes:
 
 
 def problem_of(request: Request, error: SwitchboardError) -> bytes:
-    """The same for an error of ours, with what its status wants to be said beside."""
+    """The same for an exception, with the headers and fields that its status requires."""
     if isinstance(error, _LATER):
         request.setHeader(b"retry-after", str(int(error.retry_after) + 1).encode())
     if isinstance(error, BadCredentials):
         request.setHeader(b"www-authenticate", b"Bearer")
     if isinstance(error, WrongMethod):
         request.setHeader(b"allow", error.allow.encode())
-    status = next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
-    more: dict[str, Any] = {}
+    status = getattr(error, "http_status", None) or next(
+        (status for kind, status in _STATUS if isinstance(error, kind)), 500
+    )
+    more: dict[str, Any] = dict(getattr(error, "problem_fields", {}))
     if isinstance(error, (NotAcceptable, UnsupportedMediaType)):
         more["available"] = error.available
     if isinstance(error, MaybeDone):

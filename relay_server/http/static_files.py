@@ -6,6 +6,7 @@ import gzip
 import hashlib
 import mimetypes
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,27 +14,36 @@ from twisted.web.server import Request
 from werkzeug.http import parse_accept_header
 
 from relay_protocol.limits import KIB
-from relay_server.http.connection_limits import SharedBytes
+from relay_server.http.limits import SharedBytes
 from relay_server.http.problems import problem
-from relay_server.http.request_params import field, known_tags
+from relay_server.http.request_fields import field, if_none_match
 from relay_server.http.site import ReadOnly
 
 ACCEPT_BYTES = 256
 """A longer ``Accept-Encoding`` is not parsed, and gets the file as it is."""
 
 SMALL_BYTES = KIB
-"""Compression does not shorten what fits into one packet."""
+"""Smaller files are not compressed: they fit into one packet anyway."""
 
 REVALIDATED = b"no-cache"
 IMMUTABLE = b"public, max-age=31536000, immutable"
 
 
+@cache
+def _packed(content: bytes) -> bytes:
+    """Compressed, or nothing if that saves little. All relays of a process have the same files."""
+    if len(content) <= SMALL_BYTES:
+        return b""
+    packed = gzip.compress(content, 9, mtime=0)
+    return packed if len(packed) < len(content) * 0.9 else b""
+
+
 class StaticFile:
-    """One file, also compressed where that makes it smaller.
+    """One file, also compressed if that makes it smaller.
 
     :param content_type: its media type; text gets a charset
-    :param cache_control: how long others may keep it
-    :param headers: further ones
+    :param cache_control: the ``Cache-Control`` header
+    :param headers: further headers
     """
 
     def __init__(
@@ -49,21 +59,20 @@ class StaticFile:
         self._content_type = (content_type + charset).encode()
         self._cache_control = cache_control
         self._tag = hashlib.sha256(content).hexdigest()[:24]
-        packed = b"" if len(content) <= SMALL_BYTES else gzip.compress(content, 9, mtime=0)
-        self._gzip = SharedBytes(packed if len(packed) < len(content) * 0.9 else b"")
+        self._gzip = SharedBytes(_packed(content))
 
     def answer(self, request: Request) -> bytes:
-        """The file in the encoding that the client prefers (RFC 9110 section 12.5.3), or 304 where it has it."""
+        """The file in the encoding that the client prefers (RFC 9110 section 12.5.3), or 304 if it has the file."""
         tags = {f'"{self._tag}"', f'"{self._tag}-gzip"'}
         packed = bool(self._gzip) and prefers_gzip(field(request, "accept-encoding"))
         request.setHeader(b"cache-control", self._cache_control)
         for name, value in self._headers.items():
             request.setHeader(name, value)
-        # Bytes that differ have entity tags that differ (RFC 9110 section 8.8.3.3).
+        # Each encoding needs an entity tag of its own (RFC 9110 section 8.8.3.3).
         request.setHeader(b"etag", f'"{self._tag}-gzip"' if packed else f'"{self._tag}"')
         if self._gzip:
             request.setHeader(b"vary", b"accept-encoding")
-        if tags & known_tags(request):
+        if tags & if_none_match(request):
             request.setResponseCode(304)
             return b""
         request.setHeader(b"content-type", self._content_type)
@@ -75,7 +84,7 @@ class StaticFile:
 
 
 def prefers_gzip(accept: str | None) -> bool:
-    """Whether a client with this ``Accept-Encoding`` takes gzip, and not rather the file as it is."""
+    """Whether a client with this ``Accept-Encoding`` prefers gzip to the uncompressed file."""
     if not accept or len(accept) > ACCEPT_BYTES:
         return False
     encodings = parse_accept_header(accept)
@@ -85,13 +94,26 @@ def prefers_gzip(accept: str | None) -> bool:
 
 
 class Portal(ReadOnly):
-    """The portal: its files, and its page for every address that the portal itself routes.
+    """The portal's files, and its page for all addresses that the portal itself routes.
 
-    :param folder: where it was built
+    :param folder: the built portal
     """
 
     isLeaf = True
-    PAGES = frozenset({b"", b"login", b"fleet", b"cockpit", b"alerts", b"realm"})
+    PAGES = frozenset(
+        {
+            b"",
+            b"login",
+            b"fleet",
+            b"cockpit",
+            b"alerts",
+            b"pipes",
+            b"diagram",
+            b"files",
+            b"functions",
+            b"realm",
+        }
+    )
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -108,7 +130,7 @@ class Portal(ReadOnly):
 
 
 def _read(folder: Path) -> dict[bytes, StaticFile]:
-    """The files below a folder by their paths; links that lead out of it are left out."""
+    """The files below a folder by their paths. Links to files outside of it are ignored."""
     found = {}
     for path in sorted(folder.rglob("*")):
         if not path.is_file() or not path.resolve().is_relative_to(folder):

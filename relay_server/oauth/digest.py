@@ -1,6 +1,7 @@
-"""Digest authentication with SHA-256 (RFC 7616): a program proves that it has a secret and does not send it.
+"""Digest authentication with SHA-256 (RFC 7616): an OAuth client proves that it has a secret without sending it.
 
-Only ``qop=auth`` and only SHA-256: without a count of uses an answer could be sent again, and MD5 is broken.
+Only ``qop=auth`` and SHA-256 are accepted: without a count of uses an answer could be replayed, and MD5 is
+broken.
 """
 
 from __future__ import annotations
@@ -18,23 +19,26 @@ from relay_server.access import BadCredentials
 from relay_server.auth.passwords import REALM
 
 NONCE_SECONDS = 300.0
-"""How long an answer may use a challenge."""
+"""How long a challenge may be answered."""
 
 NONCES = 10_000
-"""Challenges in use that are remembered; the longest unused are forgotten, and have to be asked for anew."""
+"""Challenges in use whose counts are remembered. With more, all challenges become invalid."""
 
 HEADER = 4096
-"""Longest header that is read, in characters."""
+"""Longest header that is parsed, in characters."""
 
 
 class StaleNonce(BadCredentials):
-    """The answer is right, perhaps, and to an old challenge: try again with the new one."""
+    """The answer may be right, but the challenge is too old: answer the new one."""
 
     code = "stale_nonce"
 
 
 class Proof(NamedTuple):
-    """What a client answered to a challenge; not checked yet."""
+    """A client's answer to a challenge, not checked yet.
+
+    :param uses: ``nc``, the count of answers to this challenge, hexadecimal
+    """
 
     key: str
     nonce: str
@@ -45,7 +49,7 @@ class Proof(NamedTuple):
 
 
 class Digest:
-    """Challenges, and what is answered to them.
+    """Makes challenges and checks the answers.
 
     :param seconds: a monotonic clock
     """
@@ -54,48 +58,56 @@ class Digest:
         self._seconds = seconds
         self._secret = secrets.token_bytes(32)
         self._used: OrderedDict[str, int] = OrderedDict()
-        """By challenge, the latest count with which it was answered."""
+        """By challenge, the highest count with which it was answered."""
 
     def challenge(self, *, stale: bool = False) -> str:
         """The value of ``WWW-Authenticate``.
 
-        :param stale: the last answer was to an old one, and its key need not be asked for again
+        :param stale: only the challenge was too old; the client need not ask for the key again
         """
         again = ", stale=true" if stale else ""
         nonce = self._nonce(self._seconds())
         return f'Digest realm="{REALM}", qop="auth", algorithm=SHA-256, charset=UTF-8, nonce="{nonce}"{again}'
 
     def read(self, header: str) -> Proof:
-        """What the value of ``Authorization`` says.
+        """Parse the value of ``Authorization``.
 
-        :raises BadCredentials: it can't be an answer to a challenge of ours
+        :raises BadCredentials: it cannot be an answer to one of our challenges
         """
         try:
-            said = Authorization.from_header(header) if len(header) <= HEADER else None
+            credentials = Authorization.from_header(header) if len(header) <= HEADER else None
         except ValueError:
-            said = None
-        if said is None or said.type != "digest":
-            raise BadCredentials("the Authorization header can't be read as an answer to a Digest challenge")
-        get = said.parameters.get
+            credentials = None
+        if credentials is None or credentials.type != "digest":
+            raise BadCredentials("the Authorization header is not a valid answer to a Digest challenge")
+        get = credentials.parameters.get
         if (get("algorithm") or "").upper() != "SHA-256" or get("qop") != "auth" or get("realm") != REALM:
             raise BadCredentials(f'answer with realm="{REALM}", algorithm=SHA-256 and qop=auth')
-        names = ("username", "nonce", "uri", "nc", "cnonce", "response")
-        values = [get(name) or "" for name in names]
-        if not all(values):
-            raise BadCredentials(f"an answer to a Digest challenge has {', '.join(names)}")
-        return Proof(*values)
+        proof = Proof(
+            key=get("username") or "",
+            nonce=get("nonce") or "",
+            uri=get("uri") or "",
+            uses=get("nc") or "",
+            cnonce=get("cnonce") or "",
+            response=get("response") or "",
+        )
+        if not all(proof):
+            raise BadCredentials(
+                "an answer to a Digest challenge has username, nonce, uri, nc, cnonce, response"
+            )
+        return proof
 
     def check(self, proof: Proof, known: str, method: str, uri: str) -> None:
-        """Check an answer, and use its count up.
+        """Check an answer, and mark its count as used.
 
-        :param known: the verifier of its key; of an unknown key something that nothing answers
-        :param uri: of the request it came with, as it came
-        :raises StaleNonce: the challenge is too old, unknown or was answered with this count before
-        :raises BadCredentials: it is wrong
+        :param known: H(A1) of the key; for an unknown key a value that nothing matches
+        :param uri: of the request, as it was sent
+        :raises StaleNonce: the challenge is too old or unknown, or was answered with this count before
+        :raises BadCredentials: the answer is wrong
         """
         body = ":".join((proof.nonce, proof.uses, proof.cnonce, "auth", _hash(f"{method}:{proof.uri}")))
-        said = proof.response.lower().encode("utf-8", "replace")
-        right = hmac.compare_digest(_hash(f"{known}:{body}").encode(), said)
+        response = proof.response.lower().encode("utf-8", "replace")
+        right = hmac.compare_digest(_hash(f"{known}:{body}").encode(), response)
         if not right or proof.uri != uri:
             raise BadCredentials("the key is unknown or the secret is wrong")
         if not self._fresh(proof.nonce):
@@ -107,14 +119,15 @@ class Digest:
             count = int(proof.uses, 16)
         except ValueError:
             raise BadCredentials(
-                "nc is the count of answers to this challenge, eight hexadecimal digits"
+                "nc must be the count of answers to this challenge, as hexadecimal digits"
             ) from None
         if count <= self._used.get(proof.nonce, 0):
-            raise StaleNonce("this answer was given before; answer the new challenge")
+            raise StaleNonce("this answer was used before; answer the new challenge")
         self._used[proof.nonce] = count
         self._used.move_to_end(proof.nonce)
         if len(self._used) > NONCES:
-            # Who still counts on it might have his last answer repeated by others: no challenge of before is good now.
+            # Without its count the last answer to a challenge could be replayed, so all challenges become
+            # invalid.
             self._secret = secrets.token_bytes(32)
             self._used.clear()
 

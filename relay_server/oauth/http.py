@@ -1,115 +1,101 @@
-"""``/oauth``: tokens for programs and people (RFC 6749), what is left of them (RFC 7662), their end (RFC 7009).
+"""``/oauth``: issues tokens (RFC 6749), inspects them (RFC 7662) and revokes them (RFC 7009).
 
-Cookies count for nothing here, so no page can ask in a person's name.
+Cookies are ignored here, so no page can act in a user's name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Awaitable
+from collections.abc import Callable
 from typing import Any, Protocol
 from urllib.parse import parse_qsl
 
-from klein import Klein
-from twisted.internet.defer import Deferred
-from twisted.logger import Logger
-from twisted.web.resource import IResource
 from twisted.web.server import Request
-from werkzeug.exceptions import HTTPException
-from werkzeug.routing import RequestRedirect
 
 from relay_db.queries import OAuthClientRecord
-from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth.authenticator import TooManyTries
-from relay_server.common.clock import detached
-from relay_server.http.openapi.operation import ApiOperation, Credential, Response, described
-from relay_server.http.openapi.schemas import (
-    AboutToken,
-    Introspection,
-    Nothing,
-    OAuthProblem,
-    TokenForm,
-    TokenInfo,
-)
-from relay_server.http.problems import problem, problem_of
-from relay_server.http.rate_limits import RequestLimits, TooManyRequests
-from relay_server.http.time_limit import in_time
+from relay_server.http.endpoint import ApiRequest, Endpoint, endpoint
+from relay_server.http.limits import TooManyRequests
+from relay_server.http.media_types import MediaType
+from relay_server.http.openapi.operation import Credential, Response
+from relay_server.http.problems import WrongMethod, problem, problem_of
 from relay_server.oauth.digest import Digest, StaleNonce
+from relay_server.oauth.schemas import AboutToken, Introspection, Nothing, OAuthProblem, TokenForm, TokenInfo
 from relay_server.oauth.service import IssuedToken, OAuthError, TokenRequest
 
 FIELDS = 32
 """Most fields of a body."""
 
-FORM = "application/x-www-form-urlencoded"
+FORM = MediaType("application/x-www-form-urlencoded")
 _PROBLEMS = {
-    400: Response("the request makes no sense, or is refused", OAuthProblem),
-    401: Response("nobody is proved", OAuthProblem),
+    400: Response("the request is not valid, or is refused", OAuthProblem),
+    401: Response("no valid credentials", OAuthProblem),
 }
 
 
 class OAuthServicePort(Protocol):
-    """What is asked; see :class:`relay_server.oauth.service.OAuthService`."""
+    """Issues tokens; see :class:`relay_server.oauth.service.OAuthService`."""
 
     digest: Digest
 
-    async def program(
+    async def authenticate_client(
         self, header: str, method: str, uri: str, address: str, inside: tuple[str, str] | None = None
     ) -> OAuthClientRecord | None:
-        """Which program asks."""
+        """The OAuth client that sent a request, ``None`` without credentials of one."""
 
     async def principal(self, token: str) -> Principal:
-        """Who asks with a token of his own."""
+        """The principal of an access token."""
 
-    async def token(self, ask: TokenRequest, program: OAuthClientRecord | None, address: str) -> IssuedToken:
-        """A token."""
+    async def token(self, ask: TokenRequest, client: OAuthClientRecord | None, address: str) -> IssuedToken:
+        """Issue a token."""
 
-    async def introspect(self, token: str, realm: str, program: str | None = None) -> dict[str, Any]:
-        """What is left of one."""
+    async def introspect(self, token: str, realm: str, client_id: str | None = None) -> Introspection:
+        """The state of a token."""
 
-    async def revoke(self, token: str, realm: str, program: str | None = None) -> None:
-        """Its end."""
+    async def revoke(self, token: str, realm: str, client_id: str | None = None) -> None:
+        """Revoke a token."""
 
 
-class OAuthResource:
-    """The three addresses as a klein application."""
-
-    log = Logger()
-    app = Klein()
-
-    def __init__(self, desk: OAuthServicePort, limits: RequestLimits) -> None:
-        self._desk = desk
-        self._limits = limits
-
-    @app.route("/oauth/token", methods=["POST"])
-    @described(
-        ApiOperation(
-            method="POST",
-            path="/oauth/token",
-            tag="oauth",
-            summary="A token (RFC 6749)",
-            more="By user and password, by key and secret of a program, or by a refresh token.",
-            body=TokenForm,
-            media=(FORM,),
-            optional=True,
-            answers={200: Response("the token", TokenInfo)},
-            problems=_PROBLEMS,
-            credential=Credential.PROGRAM,
-        )
+def _endpoint(path: str, summary: str, returns: str, **options: Any) -> Callable[[Any], Endpoint]:
+    return endpoint(
+        "POST",
+        f"/oauth/{path}",
+        tag="oauth",
+        summary=summary,
+        returns=returns,
+        reads=(FORM,),
+        problems=_PROBLEMS,
+        **options,
     )
-    def token(self, request: Request) -> Any:
-        return self._answer(request, self._token(request))
 
-    async def _token(self, request: Request) -> Any:
-        self._limits.of_network(request)
+
+class OAuthEndpoints:
+    """The three addresses below ``/oauth``. Handlers authenticate OAuth clients themselves."""
+
+    def __init__(self, service: OAuthServicePort) -> None:
+        self._service = service
+
+    @_endpoint(
+        "token",
+        "Issue a token (RFC 6749)",
+        "the token",
+        more="For user and password, for key and secret of an OAuth client, or for a refresh token.",
+        raw_body=TokenForm,
+        raw_optional=True,
+        credential=Credential.OAUTH_CLIENT,
+    )
+    async def token(self, request: ApiRequest) -> TokenInfo:
         fields = _fields(request)
-        program = await self._program(request, fields)
+        client = await self._oauth_client(request, fields)
         if "grant_type" not in fields:
-            if program is None:
-                # curl asks with an empty body whether it needs to answer a challenge.
-                raise BadCredentials("send grant_type, and prove the program by its key and secret")
+            if client is None:
+                # curl first sends an empty body, to get the challenge of Digest.
+                raise BadCredentials(
+                    "send grant_type, and authenticate the OAuth client by its key and secret"
+                )
             raise OAuthError("invalid_request", "send grant_type")
-        ask = TokenRequest(
+        wanted = TokenRequest(
             fields["grant_type"],
             username=fields.get("username", ""),
             password=fields.get("password", ""),
@@ -117,158 +103,96 @@ class OAuthResource:
             scope=fields.get("scope"),
             realm=fields.get("realm"),
         )
-        return (await self._desk.token(ask, program, _address(request))).told()
+        return (await self._service.token(wanted, client, request.address)).as_json()
 
-    @app.route("/oauth/introspect", methods=["POST"])
-    @described(
-        ApiOperation(
-            method="POST",
-            path="/oauth/introspect",
-            tag="oauth",
-            summary="What is left of a token (RFC 7662)",
-            body=AboutToken,
-            media=(FORM,),
-            answers={200: Response("what is left", Introspection)},
-            problems=_PROBLEMS,
-            credential=Credential.ASKER,
-        )
+    @_endpoint(
+        "introspect",
+        "Inspect a token (RFC 7662)",
+        "its state",
+        raw_body=AboutToken,
+        credential=Credential.OAUTH_CLIENT_OR_USER,
     )
-    def introspect(self, request: Request) -> Any:
-        return self._answer(request, self._introspect(request))
-
-    async def _introspect(self, request: Request) -> Any:
-        self._limits.of_network(request)
+    async def introspect(self, request: ApiRequest) -> Introspection:
         fields = _fields(request)
-        return await self._desk.introspect(_token_in(fields), *await self._asker(request, fields))
+        return await self._service.introspect(_token_in(fields), *await self._caller(request, fields))
 
-    @app.route("/oauth/revoke", methods=["POST"])
-    @described(
-        ApiOperation(
-            method="POST",
-            path="/oauth/revoke",
-            tag="oauth",
-            summary="End a token (RFC 7009)",
-            more="With a refresh token all that came of the same login.",
-            body=AboutToken,
-            media=(FORM,),
-            answers={200: Response("it is none any more, or never was one", Nothing)},
-            problems=_PROBLEMS,
-            credential=Credential.ASKER,
-        )
+    @_endpoint(
+        "revoke",
+        "Revoke a token (RFC 7009)",
+        "the token is not valid, any more or ever",
+        more="Revoking a refresh token revokes all tokens of the same login.",
+        raw_body=AboutToken,
+        # The token is revoked even if the OAuth client disconnects at once.
+        detached=True,
+        credential=Credential.OAUTH_CLIENT_OR_USER,
     )
-    def revoke(self, request: Request) -> Any:
-        return self._answer(request, self._revoke(request))
-
-    async def _revoke(self, request: Request) -> Any:
-        self._limits.of_network(request)
+    async def revoke(self, request: ApiRequest) -> Nothing:
         fields = _fields(request)
-        # It is done also when the program leaves at once.
-        await detached(self._revoke_token(request, fields))
+        await self._service.revoke(_token_in(fields), *await self._caller(request, fields))
         return {}
 
-    async def _revoke_token(self, request: Request, fields: dict[str, str]) -> None:
-        await self._desk.revoke(_token_in(fields), *await self._asker(request, fields))
+    # --- authentication -----------------------------------------------------------------------------------
 
-    # --- who asks -----------------------------------------------------------------------------------------
-
-    async def _asker(self, request: Request, fields: dict[str, str]) -> tuple[str, str | None]:
-        """Whose tokens may be asked about: those of the realm of who asks, a program or anybody with a token; and the
-        key of the program.
-        """
-        scheme, _, token = (request.getHeader("authorization") or "").partition(" ")
+    async def _caller(self, request: ApiRequest, fields: dict[str, str]) -> tuple[str, str | None]:
+        """Realm of the caller, and key of an OAuth client. It may use tokens of that realm and its own."""
+        scheme, _, token = (request.http.getHeader("authorization") or "").partition(" ")
         if scheme.lower() == "bearer":
-            return (await self._desk.principal(token.strip())).realm, None
-        program = await self._program(request, fields)
-        if program is None:
-            raise BadCredentials("prove yourself by a token of your own, or a program by its key and secret")
-        return program.realm, program.key
+            return (await self._service.principal(token.strip())).realm, None
+        client = await self._oauth_client(request, fields)
+        if client is None:
+            raise BadCredentials("send an access token, or the key and secret of an OAuth client")
+        return client.realm, client.key
 
-    async def _program(self, request: Request, fields: dict[str, str]) -> OAuthClientRecord | None:
-        header = request.getHeader("authorization") or ""
+    async def _oauth_client(self, request: ApiRequest, fields: dict[str, str]) -> OAuthClientRecord | None:
+        header = request.http.getHeader("authorization") or ""
         inside = (fields["client_id"], fields["client_secret"]) if fields.keys() >= _INSIDE else None
         if header and inside is not None:
             raise OAuthError(
-                "invalid_request", "prove the program in one way, not in two (RFC 6749 section 2.3)"
+                "invalid_request",
+                "authenticate the OAuth client in one way, not in two (RFC 6749 section 2.3)",
             )
-        uri = request.uri.decode("ascii", "replace")
-        return await self._desk.program(
-            header, request.method.decode("ascii"), uri, _address(request), inside
-        )
+        method, uri = request.http.method.decode("ascii"), request.http.uri.decode("ascii", "replace")
+        return await self._service.authenticate_client(header, method, uri, request.address, inside)
 
-    # --- answering ----------------------------------------------------------------------------------------
+    # --- errors -------------------------------------------------------------------------------------------
 
-    def _answer(self, request: Request, work: Any) -> Deferred[bytes]:
-        request.setHeader(b"cache-control", b"no-store")
-        running = Deferred.fromCoroutine(self._finish(request, work))
-        running.addErrback(self._unexpected, request)
-        return running
-
-    async def _finish(self, request: Request, work: Awaitable[Any]) -> bytes:
-        try:
-            result = await in_time(request, work)
-        except SwitchboardError as error:
-            return self._refuse(request, error)
-        request.setHeader(b"content-type", b"application/json")
-        return jsontext.encode(result)
-
-    def _refuse(self, request: Request, error: SwitchboardError) -> bytes:
-        """An error in the words of RFC 6749 section 5.2, which are problem details (RFC 9457), too."""
-        if isinstance(error, (TooManyTries, TooManyRequests, Unavailable)):
+    def answer_error(self, request: Request, error: SwitchboardError) -> bytes:
+        """Answer with an error as in RFC 6749 section 5.2, which is problem details (RFC 9457) as well."""
+        if isinstance(error, (TooManyTries, TooManyRequests, Unavailable, WrongMethod)):
             return problem_of(request, error)
         name, status = "invalid_request", 400
         if isinstance(error, BadCredentials):
             name, status = "invalid_client", 401
-            challenge = self._desk.digest.challenge(stale=isinstance(error, StaleNonce))
-            said = [challenge.encode(), b'Basic realm="switchboard", charset="UTF-8"']
-            request.responseHeaders.setRawHeaders(b"www-authenticate", said)
+            challenge = self._service.digest.challenge(stale=isinstance(error, StaleNonce))
+            challenges = [challenge.encode(), b'Basic realm="switchboard", charset="UTF-8"']
+            request.responseHeaders.setRawHeaders(b"www-authenticate", challenges)
         elif isinstance(error, OAuthError):
             name = error.error
         body = problem(request, status, str(error), error=name, error_description=str(error))
-        # What clients of OAuth look for.
+        # Clients of OAuth expect this type, not that of problem details.
         request.setHeader(b"content-type", b"application/json")
         return body
-
-    def _unexpected(self, failure: Any, request: Request) -> bytes:
-        if request._disconnected:
-            return b""
-        self.log.failure("{method} {path} failed", failure, method=request.method, path=request.path)
-        return problem(request, 500, "The relay failed on this request; its log tells more.")
-
-    @app.handle_errors(HTTPException)
-    def unrouted(self, request: Request, failure: Any) -> bytes:
-        """There is nothing here, or not by this method."""
-        status = 404 if isinstance(failure.value, RequestRedirect) else failure.value.code or 500
-        if status == 405:
-            request.setHeader("allow", "POST")
-        details = {404: "There is nothing at this address.", 405: "This address takes POST."}
-        return problem(request, status, details.get(status, "The request can't be served."))
 
 
 _INSIDE = {"client_id", "client_secret"}
 
 
-def resource(desk: OAuthServicePort, limits: RequestLimits) -> IResource:
-    """What serves ``/oauth``."""
-    made: IResource = OAuthResource(desk, limits).app.resource()
-    return made
+def _fields(request: ApiRequest) -> dict[str, str]:
+    """The fields of a form, each of which occurs once (RFC 6749 section 3.2).
 
-
-def _fields(request: Request) -> dict[str, str]:
-    """The fields of a body, each given once (RFC 6749 section 3.2).
-
-    :raises Invalid: it is no form, or one field is given twice
+    :raises Invalid: the body is not a form, or a field occurs twice
     """
-    body = request.content.read()
-    kind = (request.getHeader("content-type") or "").partition(";")[0].strip().lower()
-    if body and kind != FORM:
-        raise Invalid(f"send the body as {FORM}")
+    body = request.content()
+    kind = (request.http.getHeader("content-type") or "").partition(";")[0].strip().lower()
+    if body and kind != FORM.media:
+        raise Invalid(f"send the body as {FORM.media}")
     try:
         pairs = parse_qsl(body.decode(), keep_blank_values=False, max_num_fields=FIELDS, errors="strict")
     except ValueError:
-        raise Invalid(f"the body is no form in UTF-8 with {FIELDS} fields or fewer") from None
+        raise Invalid(f"the body is not a form in UTF-8 with at most {FIELDS} fields") from None
     fields = dict(pairs)
     if len(fields) < len(pairs):
-        raise Invalid("a field is given twice")
+        raise Invalid("a field occurs twice")
     return fields
 
 
@@ -276,7 +200,3 @@ def _token_in(fields: dict[str, str]) -> str:
     if "token" not in fields:
         raise OAuthError("invalid_request", "send token")
     return fields["token"]
-
-
-def _address(request: Request) -> str:
-    return getattr(request.getClientAddress(), "host", "local")

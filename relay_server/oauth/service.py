@@ -1,4 +1,4 @@
-"""Which tokens are issued, to whom, for what and for how long (RFC 6749, 7009, 7662)."""
+"""OAuth 2.0: issues, inspects and revokes tokens (RFC 6749, 7009, 7662)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ from relay_server.auth.login_limiter import LoginLimiter
 from relay_server.common.database import AsyncDatabase
 from relay_server.events.bus import EventBus
 from relay_server.oauth.digest import Digest
+from relay_server.oauth.schemas import Introspection, TokenInfo
 
 
 class OAuthError(Refused):
-    """No token, and why, in the words of RFC 6749 section 5.2.
+    """No token was issued; the error codes are those of RFC 6749 section 5.2.
 
     :param error: such as ``invalid_grant``
     """
@@ -42,10 +43,10 @@ class OAuthError(Refused):
 
 @dataclass(frozen=True)
 class TokenRequest:
-    """The body of a request for a token.
+    """The body of a token request.
 
-    :param scope: what it is to be used for; ``None`` for all that is possible
-    :param realm: in which a program wants to act, where that is not the one of its user
+    :param scope: limits the token; ``None`` for all rights of its user
+    :param realm: the realm an OAuth client wants to act in, if it is not that of its user
     """
 
     grant_type: str
@@ -58,10 +59,10 @@ class TokenRequest:
 
 @dataclass(frozen=True)
 class IssuedToken:
-    """What is issued.
+    """A response with a token.
 
     :param expires_in: seconds
-    :param refresh_token: ``None`` where there is none: a program has its secret
+    :param refresh_token: ``None`` for OAuth clients, which have a secret instead
     """
 
     access_token: str
@@ -69,28 +70,28 @@ class IssuedToken:
     scope: Scope | None
     refresh_token: str | None = None
 
-    def told(self) -> dict[str, Any]:
-        """As JSON (section 5.1)."""
-        told: dict[str, Any] = {
+    def as_json(self) -> TokenInfo:
+        """The JSON object of section 5.1."""
+        answer: TokenInfo = {
             "access_token": self.access_token,
             "token_type": "Bearer",
             "expires_in": int(self.expires_in),
         }
         if self.scope is not None:
-            told["scope"] = str(self.scope)
+            answer["scope"] = str(self.scope)
         if self.refresh_token is not None:
-            told["refresh_token"] = self.refresh_token
-        return told
+            answer["refresh_token"] = self.refresh_token
+        return answer
 
 
 ACCESS_SECONDS = 3600.0
 REFRESH_SECONDS = 30 * 86400.0
 
-_NOBODY = "0" * 64
+_NO_HA1 = "0" * 64
 
 
 class OAuthService:
-    """Issues tokens, tells what is left of them, ends them.
+    """Issues tokens, inspects and revokes them.
 
     :param seconds: a monotonic clock
     :param wall: Unix time in seconds
@@ -101,7 +102,7 @@ class OAuthService:
         store: AsyncDatabase,
         authenticator: Authenticator,
         access: Access,
-        journal: EventBus,
+        bus: EventBus,
         seconds: Callable[[], float],
         wall: Callable[[], float],
     ) -> None:
@@ -109,22 +110,22 @@ class OAuthService:
         self._store = store
         self._auth = authenticator
         self._access = access
-        self._journal = journal
+        self._bus = bus
         self._wall = wall
         self._limiter = LoginLimiter(seconds)
 
-    # --- who is it ----------------------------------------------------------------------------------------
+    # --- clients ------------------------------------------------------------------------------------------
 
-    async def program(
+    async def authenticate_client(
         self, header: str, method: str, uri: str, address: str, inside: tuple[str, str] | None = None
     ) -> OAuthClientRecord | None:
-        """The program that sent a request, by what it says of itself; ``None`` if it says nothing.
+        """Authenticate the OAuth client that sent a request; ``None`` if the request has no credentials of one.
 
         :param header: the value of ``Authorization``: Digest, or Basic (RFC 6749 section 2.3.1)
-        :param inside: key and secret that came in the body, where that is how they came
-        :raises BadCredentials: there is no such program, or the secret is wrong
+        :param inside: key and secret from the body, if they came there
+        :raises BadCredentials: there is no such OAuth client, or the secret is wrong
         :raises StaleNonce: see :class:`Digest`
-        :raises TooManyTries: judged before anything else
+        :raises TooManyTries: too many failures; decided before anything else
         """
         scheme = header.partition(" ")[0].lower()
         if scheme == "digest":
@@ -141,31 +142,29 @@ class OAuthService:
             raise TooManyTries(wait)
         self._limiter.failed(key, address)
         try:
-            found = await self._store.read(queries.find_program, key)
+            found = await self._store.read(queries.find_oauth_client, key)
         except SwitchboardError:
             self._limiter.forgive(key, address)
             raise
-        known = _NOBODY if found is None else found.verifier
+        known = _NO_HA1 if found is None else found.digest_ha1
         try:
             if scheme == "digest":
                 self.digest.check(proof, known, method, uri)
-            elif not hmac.compare_digest(passwords.verifier(key, secret), known):
+            elif not hmac.compare_digest(passwords.digest_ha1(key, secret), known):
                 raise BadCredentials("the key is unknown or the secret is wrong")
         except BadCredentials as error:
             if error.code == BadCredentials.code:
-                self._note_refused(key, found, address)
+                self._publish_refused(key, found, address)
             else:  # right, but late: no guess
                 self._limiter.forgive(key, address)
             raise
         self._limiter.succeeded(key, address)
         return found
 
-    def _note_refused(self, key: str, found: OAuthClientRecord | None, address: str) -> None:
-        self._journal.event(
+    def _publish_refused(self, key: str, found: OAuthClientRecord | None, address: str) -> None:
+        self._bus.publish(
             "login.refused",
-            "relay",
-            cause=address,
-            program=key[:64],
+            client_id=key[:64],
             realm=None if found is None else found.realm,
             address=address,
             reason=BadCredentials.code,
@@ -173,38 +172,38 @@ class OAuthService:
 
     # --- tokens -------------------------------------------------------------------------------------------
 
-    async def token(self, ask: TokenRequest, program: OAuthClientRecord | None, address: str) -> IssuedToken:
-        """A token, by the kind of grant (section 4.3, 4.4, 6).
+    async def token(
+        self, request: TokenRequest, client: OAuthClientRecord | None, address: str
+    ) -> IssuedToken:
+        """Issue a token, by the kind of grant (sections 4.3, 4.4, 6).
 
-        :raises OAuthError: none, and why
-        :raises TooManyTries: too many wrong passwords of late
+        :raises OAuthError: no token is issued
+        :raises TooManyTries: too many wrong passwords recently
         :raises Unavailable: the database does not answer
         """
-        if ask.grant_type == "password":
-            return await self._by_password(ask, address)
-        if ask.grant_type == "client_credentials":
-            return await self._by_secret(ask, program, address)
-        if ask.grant_type == "refresh_token":
-            return await self._by_refresh(ask)
+        if request.grant_type == "password":
+            return await self._by_password(request, address)
+        if request.grant_type == "client_credentials":
+            return await self._by_client_secret(request, client, address)
+        if request.grant_type == "refresh_token":
+            return await self._by_refresh(request)
         raise OAuthError(
-            "unsupported_grant_type", "grant_type is password, client_credentials or refresh_token"
+            "unsupported_grant_type", "grant_type must be password, client_credentials or refresh_token"
         )
 
-    async def _by_password(self, ask: TokenRequest, address: str) -> IssuedToken:
-        if not ask.username or not ask.password:
-            raise OAuthError("invalid_request", "send username and password")
-        scope = _scope(ask.scope, None)
+    async def _by_password(self, request: TokenRequest, address: str) -> IssuedToken:
+        if not request.username or not request.password:
+            raise OAuthError("invalid_request", "username and password are missing")
+        scope = _scope(request.scope, None)
         try:
-            login = await self._auth.password(ask.username, ask.password, address)
-            granted = _new(scope, passwords.new_token())
-            await self._store.write(_begin, login, granted, address, self._wall())
+            login = await self._auth.password(request.username, request.password, address)
+            granted = _new_token(scope, passwords.new_token())
+            await self._store.write(_open_family, login, granted, address, self._wall())
         except BadCredentials as error:
-            self._journal.event(
+            self._bus.publish(
                 "login.refused",
-                "relay",
-                cause=address,
-                user=ask.username[:NAMED],
-                realm=named_realm(ask.username),
+                user=request.username[:NAMED],
+                realm=named_realm(request.username),
                 address=address,
                 reason=error.code,
             )
@@ -213,48 +212,48 @@ class OAuthService:
             raise OAuthError("invalid_grant", str(error)) from None
         return granted
 
-    async def _by_secret(
-        self, ask: TokenRequest, program: OAuthClientRecord | None, address: str
+    async def _by_client_secret(
+        self, request: TokenRequest, client: OAuthClientRecord | None, address: str
     ) -> IssuedToken:
-        if program is None:
-            raise BadCredentials("prove the program by its key and secret: Digest, or Basic over TLS")
-        scope = _scope(ask.scope, program.scope)
-        another = ask.realm is not None and normalise(ask.realm) != program.realm
-        if another and scope is not None and not scope.anywhere:
+        if client is None:
+            raise BadCredentials("send the OAuth client's key and secret: by Digest, or by Basic over TLS")
+        scope = _scope(request.scope, client.scope)
+        another = request.realm is not None and normalise(request.realm) != client.realm
+        if another and scope is not None and not scope.realm_independent:
             raise OAuthError(
                 "invalid_scope",
-                "in another realm a token is for a scope that names no robots and has no 'admin': those meant are of "
-                "the program's own",
+                "in another realm the scope must name no robots and must not have 'admin': these belong to "
+                "the OAuth client's own realm",
             )
-        granted = _new(scope, None)
-        await self._store.write(_to_program, program, ask.realm, granted, address, self._wall())
+        granted = _new_token(scope, None)
+        await self._store.write(_issue_to_client, client, request.realm, granted, address, self._wall())
         return granted
 
-    async def _by_refresh(self, ask: TokenRequest) -> IssuedToken:
-        if not ask.refresh_token:
+    async def _by_refresh(self, request: TokenRequest) -> IssuedToken:
+        if not request.refresh_token:
             raise OAuthError("invalid_request", "send refresh_token")
-        # What can't be granted must not cost the token.
-        wanted = _scope(ask.scope, None)
+        # An invalid scope must not use up the refresh token.
+        scope = _scope(request.scope, None)
         refresh = passwords.new_token()
-        family = await self._store.write(_refresh, ask.refresh_token, refresh, wanted, self._wall())
+        family = await self._store.write(_refresh, request.refresh_token, refresh, scope, self._wall())
         if isinstance(family, OAuthError):
             await self._access.refresh()
             raise family
         return family
 
-    # --- what is left of them ------------------------------------------------------------------------------
+    # --- inspection and revocation -------------------------------------------------------------------------
 
-    async def introspect(self, token: str, realm: str, program: str | None = None) -> dict[str, Any]:
-        """What a token is good for, and for how long (RFC 7662 section 2.2).
+    async def introspect(self, token: str, realm: str, client_id: str | None = None) -> Introspection:
+        """The state of a token: its user, scope and expiry (RFC 7662 section 2.2).
 
-        :param realm: of who asks; tokens of others are not active to him
-        :param program: the key of the program that asks, whose own tokens are, of whatever realm
+        :param realm: of the caller; tokens of other realms count as inactive
+        :param client_id: key of the calling OAuth client; its own tokens count in any realm
         """
         now = self._wall()
-        record = await self._store.read(queries.issued, passwords.token_hash(token), now)
-        if record is None or (record.realm != realm and (program is None or record.program != program)):
+        record = await self._store.read(queries.issued_token, passwords.token_hash(token), now)
+        if record is None or (record.realm != realm and (client_id is None or record.client_id != client_id)):
             return {"active": False}
-        told: dict[str, Any] = {
+        claims: Introspection = {
             "active": True,
             "token_type": "Bearer" if record.kind == "access" else "refresh_token",
             "username": record.user,
@@ -263,26 +262,26 @@ class OAuthService:
             "iat": int(record.created),
         }
         if record.scope is not None:
-            told["scope"] = record.scope
-        if record.program is not None:
-            told["client_id"] = record.program
+            claims["scope"] = record.scope
+        if record.client_id is not None:
+            claims["client_id"] = record.client_id
         if record.expires is not None:
-            told["exp"] = int(record.expires)
-            told["expires_in"] = int(record.expires - now)
-        return told
+            claims["exp"] = int(record.expires)
+            claims["expires_in"] = int(record.expires - now)
+        return claims
 
-    async def revoke(self, token: str, realm: str, program: str | None = None) -> None:
-        """Make a token worthless, and cut what was opened with it; also says nothing of one that is none.
+    async def revoke(self, token: str, realm: str, client_id: str | None = None) -> None:
+        """Revoke a token, and cut the connections that use it. An unknown token is not an error.
 
-        :param realm: of who asks
-        :param program: the key of the program that asks
+        :param realm: of the caller
+        :param client_id: key of the calling OAuth client
         """
-        gone = await self._store.write(queries.revoke_issued, passwords.token_hash(token), realm, program)
+        gone = await self._store.write(queries.revoke_issued, passwords.token_hash(token), realm, client_id)
         if gone:
             await self._access.refresh()
 
     async def principal(self, token: str) -> Principal:
-        """Who asks about tokens with one of his own.
+        """The caller that inspects tokens with a token of its own.
 
         :raises BadCredentials: unknown, expired or revoked
         """
@@ -290,9 +289,9 @@ class OAuthService:
 
 
 def _scope(asked: str | None, most: str | None) -> Scope | None:
-    """What a new token is for.
+    """The scope of a new token.
 
-    :raises OAuthError: it can't be read, or is more than what there is to give
+    :raises OAuthError: it cannot be parsed, or is wider than allowed
     """
     given = None if most is None else Scope(most)
     if asked is None:
@@ -302,78 +301,78 @@ def _scope(asked: str | None, most: str | None) -> Scope | None:
     except Invalid as error:
         raise OAuthError("invalid_scope", str(error)) from None
     if given is not None and not scope.within(given):
-        raise OAuthError("invalid_scope", f"at most '{given}' can be given here")
+        raise OAuthError("invalid_scope", f"the scope may be at most '{given}'")
     return scope
 
 
-def _new(scope: Scope | None, refresh: str | None) -> IssuedToken:
+def _new_token(scope: Scope | None, refresh: str | None) -> IssuedToken:
     return IssuedToken(passwords.new_token(), ACCESS_SECONDS, scope, refresh)
 
 
-def _text(scope: Scope | None) -> str | None:
+def _scope_text(scope: Scope | None) -> str | None:
     return None if scope is None else str(scope)
 
 
-def _begin(s: Session, login: LoginResult, granted: IssuedToken, address: str, now: float) -> None:
-    """A family, its first access token and the audit entry: all or nothing."""
+def _open_family(s: Session, login: LoginResult, granted: IssuedToken, address: str, now: float) -> None:
+    """Store a token family, its first access token and the audit entry, all or nothing."""
     assert granted.refresh_token is not None
-    family = queries.open_family(
+    family = queries.open_token_family(
         s,
         login.user_id,
         passwords.token_hash(granted.refresh_token),
         password_hash=login.password_hash,
-        scope=_text(granted.scope),
+        scope=_scope_text(granted.scope),
         expires=now + REFRESH_SECONDS,
         now=now,
     )
-    _keep(s, login.user_id, granted, now, family_id=family)
+    _store_token(s, login.user_id, granted, now, family_id=family)
     _audit(s, login.full, "password", granted, address, now)
 
 
-def _to_program(
-    s: Session, program: OAuthClientRecord, realm: str | None, granted: IssuedToken, address: str, now: float
+def _issue_to_client(
+    s: Session, client: OAuthClientRecord, realm: str | None, granted: IssuedToken, address: str, now: float
 ) -> None:
-    """An access token for a program, if it is still there, and the audit entry.
+    """Store an access token for an OAuth client that still exists, and the audit entry.
 
-    :param realm: in which its user has an account too, where it is to be for that one
+    :param realm: the realm to act in, where its user needs an account
     """
-    if queries.find_program(s, program.key) is None:
+    if queries.find_oauth_client(s, client.key) is None:
         raise BadCredentials("the key is unknown or the secret is wrong")
-    user_id, full = program.user_id, full_name(program.user, program.realm)
+    user_id, full = client.user_id, full_name(client.user, client.realm)
     if realm is not None:
-        account = queries.account_in(s, program.user_id, realm)
+        account = queries.linked_account_in(s, client.user_id, realm)
         if account is None or account.disabled:
-            raise OAuthError("invalid_target", "the program's user has no account in that realm")
+            raise OAuthError("invalid_target", "the OAuth client's user has no account in that realm")
         user_id, full = account.id, account.full
-    _keep(s, user_id, granted, now, program_id=program.id)
-    _audit(s, full, "program", granted, address, now, program=program.key)
+    _store_token(s, user_id, granted, now, oauth_client_id=client.id)
+    _audit(s, full, "oauth_client", granted, address, now, client_id=client.key)
 
 
-def _refresh(s: Session, old: str, new: str, wanted: Scope | None, now: float) -> IssuedToken | OAuthError:
-    """The next tokens of a family; an error is returned, so that what it ended stays ended."""
-    before = queries.issued(s, passwords.token_hash(old), now)
+def _refresh(s: Session, old: str, new: str, scope: Scope | None, now: float) -> IssuedToken | OAuthError:
+    """The next tokens of a family. An error is returned and not raised, so that the end of the family is committed."""
+    before = queries.issued_token(s, passwords.token_hash(old), now)
     if before is not None and before.kind == "refresh":
-        error = _too_much(before, wanted)
+        error = _scope_error(before, scope)
         if error is not None:
             return error
-    family = queries.refresh_family(s, passwords.token_hash(old), passwords.token_hash(new), now)
+    family = queries.refresh_token_family(s, passwords.token_hash(old), passwords.token_hash(new), now)
     if family is None or family.family_id is None:
         return OAuthError(
-            "invalid_grant", "the refresh token is unknown, used before, expired or revoked; log in again"
+            "invalid_grant", "the refresh token is unknown, expired, revoked or was used before; log in again"
         )
     own = None if family.scope is None else Scope(family.scope)
-    granted = _new(wanted or own, new)
-    _keep(s, family.user_id, granted, now, family_id=family.family_id)
+    granted = _new_token(scope or own, new)
+    _store_token(s, family.user_id, granted, now, family_id=family.family_id)
     return granted
 
 
-def _too_much(before: IssuedRecord, wanted: Scope | None) -> OAuthError | None:
-    if wanted is None or before.scope is None or wanted.within(Scope(before.scope)):
+def _scope_error(before: IssuedRecord, scope: Scope | None) -> OAuthError | None:
+    if scope is None or before.scope is None or scope.within(Scope(before.scope)):
         return None
-    return OAuthError("invalid_scope", f"at most '{before.scope}' can be given here")
+    return OAuthError("invalid_scope", f"the scope may be at most '{before.scope}'")
 
 
-def _keep(s: Session, user_id: int, granted: IssuedToken, now: float, **belongs: int) -> None:
+def _store_token(s: Session, user_id: int, granted: IssuedToken, now: float, **belongs: int) -> None:
     queries.create_token(
         s,
         user_id,
@@ -382,7 +381,7 @@ def _keep(s: Session, user_id: int, granted: IssuedToken, now: float, **belongs:
         label="oauth",
         expires=now + granted.expires_in,
         now=now,
-        scope=_text(granted.scope),
+        scope=_scope_text(granted.scope),
         **belongs,
     )
 
@@ -390,16 +389,16 @@ def _keep(s: Session, user_id: int, granted: IssuedToken, now: float, **belongs:
 def _audit(
     s: Session, user: str, how: str, granted: IssuedToken, address: str, now: float, **data: Any
 ) -> None:
-    told = {"how": how, "scope": _text(granted.scope), **data}
+    data = {"how": how, "scope": _scope_text(granted.scope), **data}
     queries.append_audit(
-        s, at=now, actor=f"user:{user}", action="token.issue", target=user, origin=address, data=told
+        s, at=now, actor=f"user:{user}", action="token.issue", target=user, origin=address, data=data
     )
 
 
 def _basic(header: str) -> tuple[str, str]:
-    """Key and secret of ``Authorization: Basic`` (RFC 7617), form-encoded as RFC 6749 section 2.3.1 has it.
+    """Key and secret of ``Authorization: Basic`` (RFC 7617), form-encoded as in RFC 6749 section 2.3.1.
 
-    :raises BadCredentials: it can't be read
+    :raises BadCredentials: it cannot be parsed
     """
     try:
         text = base64.b64decode(header.partition(" ")[2].strip(), validate=True).decode()
@@ -407,5 +406,5 @@ def _basic(header: str) -> tuple[str, str]:
         text = ""
     key, colon, secret = text.partition(":")
     if not colon:
-        raise BadCredentials("the Authorization header can't be read as Basic")
+        raise BadCredentials("the Authorization header is not valid Basic")
     return unquote_plus(key), unquote_plus(secret)

@@ -1,1 +1,1 @@
-"""Administration of a realm over HTTP and by the command line (SPEC section 1.16)."""
+"""Administration of a realm over HTTP and by the command line (SPEC 1.16)."""

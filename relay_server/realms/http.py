@@ -1,31 +1,26 @@
-"""``/api/v1/realm``: an administrator's own realm, and nothing of another (SPEC section 1.16)."""
+"""``/api/v1/realm``: administration of the caller's own realm (SPEC 1.16)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any, TypeVar, cast
 from urllib.parse import quote
 
-from klein import Klein
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import astuple
-from twisted.web.resource import IResource
-from twisted.web.server import Request
-from werkzeug.exceptions import HTTPException
 
+from relay_protocol import jsontext
 from relay_protocol.errors import NotFound
-from relay_server.access import Principal
-from relay_server.http.api import Api, body_of
-from relay_server.http.conditional import TAGGED, answers, changed, told_facts
-from relay_server.http.idempotent_requests import see_no_key
-from relay_server.http.openapi.operation import ApiOperation, Parameter, Response, described, header, query
-from relay_server.http.request_params import KNOWN, UNTYPED, field, query_of
+from relay_protocol.limits import NAME
+from relay_server.common.etags import tag_of
+from relay_server.http.endpoint import ApiRequest, Created, Endpoint, IdempotencyKey, Tagged, endpoint
+from relay_server.http.openapi.operation import header
 from relay_server.realms import robots, users
 from relay_server.realms.realm_change import Precondition
 from relay_server.realms.schemas import (
     GrantBody,
     NewGroup,
-    NewProgram,
+    NewOAuthClient,
     NewRobot,
     NewRobotGroup,
     NewUser,
@@ -35,9 +30,9 @@ from relay_server.realms.schemas import (
     RealmGroup,
     RealmGroups,
     RealmKeys,
-    RealmNewProgram,
+    RealmNewOAuthClient,
     RealmNewRobot,
-    RealmPrograms,
+    RealmOAuthClients,
     RealmRight,
     RealmRights,
     RealmRobot,
@@ -51,539 +46,372 @@ from relay_server.realms.schemas import (
     UserChange,
 )
 from relay_server.realms.service import RealmService
-from relay_server.resources.page import PageQuery, see_known
+from relay_server.resources.page import PageQuery
 
-HERE = "/api/v1/realm"
+T = TypeVar("T")
 
-PAGED = UNTYPED
-_MATCH = header("If-Match", "entity tags: only if it is one of these; `*`: only if it is there")
-_NONE = header("If-None-Match", "`*`: only if it is not there")
-_PLACED = {"Location": "its address"}
+BASE_PATH = "/api/v1/realm"
+
+_NONE = header("If-None-Match", "`*`: only if the holder has no right on the robot")
 _IN_PATH = {
     "user": "name of a user",
-    "group": "name of a group",
-    "robot": "name of a robot",
-    "holder": "name of a user, or `@` and that of a group",
-    "fingerprint": "of a key",
+    "holder": "name of a user, or `@` and the name of a group",
+    "fingerprint": "fingerprint of a key",
     "member": "name of a robot",
-    "key": "of a program",
-    "id": "what an earlier answer gave as `id`",
+    "key": "key of an OAuth client",
+    "id": "`id` of an earlier answer",
+}
+_NAMED = {
+    "users": "name of a user",
+    "groups": "name of a group",
+    "robots": "name of a robot",
+    "robot-groups": "name of a group",
+    "rights": "name of a robot",
 }
 
 
-def _operation(
-    method: str, path: str, summary: str, answers: dict[int, Response], *, named: str = "", **more: Any
-) -> ApiOperation:
-    """:param named: what ``{name}`` in the address is the name of"""
-    inside = {"name": named} if named else {}
-    inside |= {
-        name: name
-        for name in ("user", "member", "holder", "fingerprint", "key", "id")
-        if f"{{{name}}}" in path
-    }
-    placed = tuple(Parameter(name, _IN_PATH[what], str, "path", True) for name, what in inside.items())
-    parameters = (*placed, *more.pop("parameters", ()))
-    place = f"{HERE}/{path}" if path else HERE
-    return ApiOperation(
-        method=method,
-        path=place,
-        tag="realm",
-        summary=summary,
-        parameters=parameters,
-        answers=answers,
-        **more,
-    )
+class RightsQuery(PageQuery, frozen=True, forbid_unknown_fields=True):
+    """Filters of a list of rights.
+
+    :param robot: only rights on this robot
+    :param user: only rights of this user, including those of groups
+    """
+
+    robot: Annotated[str, Meta(max_length=NAME)] | UnsetType = UNSET
+    user: Annotated[str, Meta(max_length=NAME)] | UnsetType = UNSET
 
 
-def _page(path: str, summary: str, page: Any, *others: Parameter, **more: Any) -> ApiOperation:
-    return _told(path, summary, "a page", page, parameters=(*PAGED, *others), **more)
+def _endpoint(
+    method: str, path: str, summary: str, returns: Any, **options: Any
+) -> Callable[[Any], Endpoint]:
+    names = {name: words for name, words in _IN_PATH.items() if f"{{{name}}}" in path}
+    if "{name}" in path:
+        names["name"] = _NAMED[path.partition("/")[0]]
+    place = f"{BASE_PATH}/{path}" if path else BASE_PATH
+    return endpoint(method, place, tag="realm", summary=summary, returns=returns, names=names, **options)
 
 
-def _told(path: str, summary: str, words: str, body: Any, **more: Any) -> ApiOperation:
-    """What is read, with an entity tag."""
-    parameters = (*more.pop("parameters", ()), KNOWN)
-    return _operation("GET", path, summary, answers(words, body), parameters=parameters, **more)
+def _get(path: str, summary: str, returns: str = "a page", **options: Any) -> Callable[[Any], Endpoint]:
+    return _endpoint("GET", path, summary, returns, **options)
 
 
-def _new(path: str, summary: str, body: Any, made: Any, **more: Any) -> ApiOperation:
-    answers = {201: Response("added", made, headers=_PLACED)}
-    return _operation("POST", path, summary, answers, body=body, errors=(409,), **more)
+def _post(path: str, summary: str, returns: str = "added", **options: Any) -> Callable[[Any], Endpoint]:
+    options = {"key": IdempotencyKey.REFUSED, "errors": (409,), **options}
+    return _endpoint("POST", path, summary, returns, **options)
 
 
-def _gone(path: str, summary: str, **more: Any) -> ApiOperation:
-    return _operation("DELETE", path, summary, {204: Response("done")}, **more)
+def _patch(path: str, summary: str, returns: str, **options: Any) -> Callable[[Any], Endpoint]:
+    return _endpoint("PATCH", path, summary, returns, if_match=True, **options)
 
 
-def _joined(path: str, what: str) -> ApiOperation:
-    answers = {204: Response(f"the {what} is in it")}
-    return _operation("PUT", path, f"Put a {what} into a group", answers, named="group", errors=(409,))
+def _delete(path: str, summary: str, **options: Any) -> Callable[[Any], Endpoint]:
+    return _endpoint("DELETE", path, summary, "done", **options)
 
 
-ABOUT = _told("", "The caller's own realm", "the realm", RealmAbout)
-CHANGE = _operation(
-    "PATCH",
-    "",
-    "Say how long the realm's memory keeps events",
-    {200: Response("the realm", RealmAbout, headers=TAGGED)},
-    more="Takes a token without a scope. The relay goes by it within ten minutes.",
-    body=RealmChange,
-    parameters=(_MATCH,),
-    errors=(412,),
-)
+class RealmEndpoints:
+    """A realm, for its administrators."""
 
-USERS = _page("users", "Users", RealmUsers)
-NEW_USER = _new("users", "Add a user", NewUser, RealmUser)
-USER = _told("users/{name}", "One user", "the user", RealmUser, named="user")
-CHANGE_USER = _operation(
-    "PATCH",
-    "users/{name}",
-    "Change a user",
-    {200: Response("the user", RealmUser, headers=TAGGED)},
-    named="user",
-    more="Nobody disables himself, or ceases to be an administrator by his own hand.",
-    parameters=(_MATCH,),
-    body=UserChange,
-    errors=(409, 412),
-)
-REMOVE_USER = _gone("users/{name}", "Remove a user with rights and tokens", named="user", errors=(409,))
-TOKENS = _page("users/{name}/tokens", "A user's tokens and browser sessions", RealmTokens, named="user")
-REVOKE_TOKEN = _gone("tokens/{id}", "Make a token worthless, and cut what it opened")
+    def __init__(self, service: RealmService) -> None:
+        self._service = service
 
-PROGRAMS = _page("users/{name}/programs", "A user's programs, which act as him", RealmPrograms, named="user")
-NEW_PROGRAM = _new(
-    "users/{name}/programs",
-    "Add a program that acts as a user",
-    NewProgram,
-    RealmNewProgram,
-    named="user",
-    more="It gets tokens by its key and its secret, which is told this once.",
-)
-REVOKE_PROGRAM = _gone("programs/{key}", "Make a program worthless with its tokens, and cut what they opened")
+    # --- shared by all endpoints --------------------------------------------------------------------------
 
-GROUPS = _page("groups", "Groups of users", RealmGroups)
-NEW_GROUP = _new("groups", "Add a group", NewGroup, RealmGroup)
-GROUP = _told("groups/{name}", "One group", "the group", RealmGroup, named="group")
-REMOVE_GROUP = _gone("groups/{name}", "Remove a group with its rights", named="group")
-JOIN = _joined("groups/{name}/members/{user}", "user")
-LEAVE = _gone("groups/{name}/members/{user}", "Take a user out of a group", named="group")
+    def admit(self, request: ApiRequest) -> None:
+        """Check that the sender is an administrator, and count the change that the request makes.
 
-ROBOTS = _page("robots", "Robots, enrolled or not", RealmRobots)
-NEW_ROBOT = _new("robots", "Add a robot", NewRobot, RealmNewRobot)
-ROBOT = _told("robots/{name}", "One robot", "the robot", RealmRobot, named="robot")
-CHANGE_ROBOT = _operation(
-    "PATCH",
-    "robots/{name}",
-    "Change a robot's description",
-    {200: Response("the robot", RealmRobot, headers=TAGGED)},
-    named="robot",
-    parameters=(_MATCH,),
-    body=RobotChange,
-    errors=(412,),
-)
-REMOVE_ROBOT = _gone(
-    "robots/{name}",
-    "Remove a robot with its keys, rights and recordings",
-    named="robot",
-    more="Its link is cut.",
-)
-NEW_CODE = _operation(
-    "POST",
-    "robots/{name}/code",
-    "A new code for a robot to enrol with",
-    {201: Response("the code", RealmCode)},
-    named="robot",
-    more="One that was not used yet is void.",
-)
-KEYS = _page("robots/{name}/keys", "All keys that a robot ever had", RealmKeys, named="robot")
-REVOKE_KEY = _gone(
-    "robots/{name}/keys/{fingerprint}", "Retire a key, and cut a link that uses it", named="robot"
-)
+        :raises Refused: the sender is not an administrator, or changes the realm too often
+        :raises NotFound: the address contains an escaped slash
+        """
+        http = request.http
+        # grant() counts a right by its patterns.
+        counted = http.method not in (b"GET", b"HEAD") and not (
+            http.method == b"PUT" and http.path.startswith(f"{BASE_PATH}/rights/".encode())
+        )
+        self._service.admit(request.principal, changes=counted)
+        if b"%2f" in http.path.lower():
+            # http/site.py removes escaped slashes, so the rest could be the name of another user.
+            raise NotFound(
+                "names with a '/' are not available here; use the command line 'switchboard' for them"
+            )
 
-ROBOT_GROUPS = _page("robot-groups", "Groups of robots", RealmRobotGroups)
-NEW_ROBOT_GROUP = _new("robot-groups", "Add a group of robots", NewRobotGroup, RealmRobotGroup)
-ROBOT_GROUP = _told("robot-groups/{name}", "One group of robots", "the group", RealmRobotGroup, named="group")
-REMOVE_ROBOT_GROUP = _gone("robot-groups/{name}", "Remove a group; its robots stay", named="group")
-JOIN_ROBOT = _joined("robot-groups/{name}/members/{member}", "robot")
-LEAVE_ROBOT = _gone("robot-groups/{name}/members/{member}", "Take a robot out of a group", named="group")
+    async def _read(self, request: ApiRequest, kind: type[T], query: Callable[..., Any], *args: Any) -> T:
+        """The result of a query.
 
-RIGHTS = _page(
-    "rights",
-    "Rights as they were given",
-    RealmRights,
-    query("robot", "on this robot only"),
-    query("user", "of this user only, also by groups"),
-    errors=(404,),
-)
-RIGHT = _told("rights/{name}/{holder}", "One right", "the right", RealmRight, named="robot")
-GRANT = _operation(
-    "PUT",
-    "rights/{name}/{holder}",
-    "Give a right, in the place of the one the holder has on the robot",
-    {
-        200: Response("in the place of another", RealmRight, headers=TAGGED),
-        201: Response("given", RealmRight, headers={**_PLACED, **TAGGED}),
-    },
-    named="robot",
-    parameters=(_MATCH, _NONE),
-    body=GrantBody,
-    errors=(409, 412),
-)
-REVOKE = _gone(
-    "rights/{name}/{holder}", "Take a right away", named="robot", more="What is open by it is cut."
-)
+        :param kind: its type
+        """
+        return cast(T, await self._service.read(request.principal, query, *args))
 
-_PAGED = tuple(each.name for each in PAGED)
+    async def _change(
+        self, request: ApiRequest, kind: type[T], work: Callable[..., Any], *args: Any, **more: Any
+    ) -> T:
+        """The result of a change.
 
+        :param kind: its type
+        """
+        done = await self._service.change(request.principal, request.address, work, *args, **more)
+        return cast(T, done)
 
-class RealmResource:
-    """The addresses below ``/api/v1/realm``, for one request."""
+    async def _done(self, request: ApiRequest, work: Callable[..., Any], *args: Any) -> None:
+        await self._service.change(request.principal, request.address, work, *args)
 
-    app = Klein()
-
-    def __init__(self, desk: RealmService, api: Api) -> None:
-        self._desk = desk
-        self._api = api
-
-    # --- who asks, and what becomes of it -----------------------------------------------------------------
-
-    async def _admitted(self, request: Request, *, changes: bool = False) -> Principal:
-        """The administrator who asks; nothing is looked at before he is known to be one."""
-        principal = await self._api.principal(request)
-        self._desk.admit(principal, changes=changes)
-        if request.method == b"POST":
-            see_no_key(request)
-        if b"%2f" in request.path.lower():
-            # Addresses lose slashes (http/site.py): somebody else could be meant by what is left.
-            raise NotFound("names with a '/' are not known here; see to them by the command line")
-        return principal
-
-    def _told(self, request: Request, query: Callable[..., Any], *args: Any) -> Any:
-        async def work() -> Any:
-            told = await self._desk.read(await self._admitted(request), query, *args)
-            return told_facts(request, told)
-
-        return self._api.answer(request, work())
-
-    def _page(
-        self, request: Request, query: Callable[..., Any], *args: Any, filters: tuple[str, ...] = ()
-    ) -> Any:
-        async def work() -> Any:
-            principal, asked = await self._admitted(request), query_of(request)
-            see_known(asked, *_PAGED, *filters)
-            listing = PageQuery.of({name: text for name, text in asked.items() if name in _PAGED})
-            chosen = [asked.get(name) for name in filters]
-            page = await self._desk.read(principal, query, *args, listing, *chosen)
-            return told_facts(request, page)
-
-        return self._api.answer(request, work())
-
-    def _done(self, request: Request, work: Callable[..., Any], *args: Any) -> Any:
-        async def change() -> Any:
-            principal = await self._admitted(request, changes=True)
-            return await self._desk.change(principal, _address(request), work, *args)
-
-        return self._api.answer(request, change())
-
-    def _added(
+    async def _added(
         self,
-        request: Request,
-        kind: type[Struct],
+        request: ApiRequest,
+        kind: type[T],
+        body: Struct,
         work: Callable[..., Any],
         place: str,
         named: str,
         *args: Any,
-    ) -> Any:
-        """Add something that the body says, and answer with it.
+    ) -> Created[T]:
+        """Add a resource. The fields of the body follow the other arguments of ``work``.
 
-        :param kind: of the body, whose fields follow the others in ``work``
-        :param place: the collection it is in, where ``named`` is the field that has its name
+        :param kind: type of the result
+        :param place: the collection of the resource
+        :param named: the field of the result with its name
         """
+        new = (None if each is UNSET else each for each in astuple(body))
+        added: Any = await self._change(request, kind, work, *args, *new)
+        return Created(added, location=_location(place, added[named]))
 
-        async def add() -> Any:
-            principal = await self._admitted(request, changes=True)
-            new = (None if each is UNSET else each for each in astuple(body_of(request, kind)))
-            told = await self._desk.change(principal, _address(request), work, *args, *new)
-            return _made(request, told, place, told[named])
+    @_get("", "The caller's own realm", "the realm")
+    async def about(self, request: ApiRequest) -> RealmAbout:
+        return await self._read(request, RealmAbout, users.realm_info)
 
-        return self._api.answer(request, add())
-
-    @app.route("/", methods=["GET"])
-    @described(ABOUT)
-    def about(self, request: Request) -> Any:
-        return self._told(request, users.about)
-
-    @app.route("/", methods=["PATCH"])
-    @described(CHANGE)
-    def change(self, request: Request) -> Any:
-        return self._api.answer(request, self._change(request))
-
-    async def _change(self, request: Request) -> Any:
-        principal = await self._admitted(request, changes=True)
-        days = body_of(request, RealmChange).events_days
-        told = await self._desk.change(
-            principal, _address(request), users.keep_events, days, seen=_seen(request)
-        )
-        return changed(request, told)
+    @_patch(
+        "",
+        "Set for how long events are stored",
+        "the realm",
+        more="Needs a token without a scope. It takes effect within ten minutes.",
+    )
+    async def change(self, request: ApiRequest, body: RealmChange) -> Tagged[RealmAbout]:
+        seen = _seen(request)
+        return Tagged(await self._change(request, RealmAbout, users.keep_events, body.events_days, seen=seen))
 
     # --- users --------------------------------------------------------------------------------------------
 
-    @app.route("/users", methods=["GET"])
-    @described(USERS)
-    def users(self, request: Request) -> Any:
-        return self._page(request, users.users)
+    @_get("users", "Users")
+    async def users(self, request: ApiRequest, query: PageQuery) -> RealmUsers:
+        return await self._read(request, RealmUsers, users.users, query)
 
-    @app.route("/users", methods=["POST"])
-    @described(NEW_USER)
-    def add_user(self, request: Request) -> Any:
-        return self._api.answer(request, self._add_user(request))
+    @_post("users", "Add a user")
+    async def add_user(self, request: ApiRequest, body: NewUser) -> Created[RealmUser]:
+        hashed = await self._hash(request, body.password)
+        added = await self._change(request, RealmUser, users.add_user, body.name, hashed, body.admin)
+        return Created(added, location=_location("users", added["user"]))
 
-    async def _add_user(self, request: Request) -> Any:
-        principal = await self._admitted(request, changes=True)
-        new = body_of(request, NewUser)
-        hashed = await self._hash(principal, new.password)
-        told = await self._desk.change(
-            principal, _address(request), users.add_user, new.name, hashed, new.admin
+    @_get("users/{name}", "One user", "the user")
+    async def user(self, request: ApiRequest, name: str) -> RealmUser:
+        return await self._read(request, RealmUser, users.user, name)
+
+    @_patch(
+        "users/{name}",
+        "Change a user",
+        "the user",
+        more="Administrators can neither disable themselves nor give up administration.",
+        errors=(409,),
+    )
+    async def change_user(self, request: ApiRequest, name: str, body: UserChange) -> Tagged[RealmUser]:
+        disabled, admin = (None if each is UNSET else each for each in (body.disabled, body.admin))
+        wanted = await self._hash(request, body.password), disabled, admin
+        seen = _seen(request)
+        return Tagged(await self._change(request, RealmUser, users.change_user, name, *wanted, seen=seen))
+
+    async def _hash(self, request: ApiRequest, password: str | UnsetType) -> str | None:
+        return None if password is UNSET else await self._service.new_hash(request.principal, password)
+
+    @_delete("users/{name}", "Remove a user with their rights and tokens", errors=(409,))
+    async def remove_user(self, request: ApiRequest, name: str) -> None:
+        await self._done(request, users.remove_user, name)
+
+    @_get("users/{name}/tokens", "A user's tokens and browser sessions")
+    async def tokens(self, request: ApiRequest, name: str, query: PageQuery) -> RealmTokens:
+        return await self._read(request, RealmTokens, users.tokens, name, query)
+
+    @_delete("tokens/{id}", "Revoke a token, and close its connections")
+    async def revoke_token(self, request: ApiRequest, id: str) -> None:
+        await self._done(request, users.revoke_token, id)
+
+    # --- OAuth clients ------------------------------------------------------------------------------------
+
+    @_get("users/{name}/oauth-clients", "OAuth clients that act as a user")
+    async def oauth_clients(self, request: ApiRequest, name: str, query: PageQuery) -> RealmOAuthClients:
+        return await self._read(request, RealmOAuthClients, users.oauth_clients, name, query)
+
+    @_post(
+        "users/{name}/oauth-clients",
+        "Add an OAuth client that acts as a user",
+        more="It gets tokens by its key and its secret. The secret is shown only in this answer.",
+    )
+    async def add_oauth_client(
+        self, request: ApiRequest, name: str, body: NewOAuthClient
+    ) -> Created[RealmNewOAuthClient]:
+        return await self._added(
+            request, RealmNewOAuthClient, body, users.add_oauth_client, "oauth-clients", "key", name
         )
-        return _made(request, told, "users", told["user"])
 
-    @app.route("/users/<name>", methods=["GET"])
-    @described(USER)
-    def user(self, request: Request, name: str) -> Any:
-        return self._told(request, users.user, name)
-
-    @app.route("/users/<name>", methods=["PATCH"])
-    @described(CHANGE_USER)
-    def change_user(self, request: Request, name: str) -> Any:
-        return self._api.answer(request, self._change_user(request, name))
-
-    async def _change_user(self, request: Request, name: str) -> Any:
-        principal = await self._admitted(request, changes=True)
-        new = body_of(request, UserChange)
-        disabled, admin = (None if each is UNSET else each for each in (new.disabled, new.admin))
-        wanted = await self._hash(principal, new.password), disabled, admin
-        told = await self._desk.change(
-            principal, _address(request), users.change_user, name, *wanted, seen=_seen(request)
-        )
-        return changed(request, told)
-
-    async def _hash(self, principal: Principal, password: str | UnsetType) -> str | None:
-        return None if password is UNSET else await self._desk.new_hash(principal, password)
-
-    @app.route("/users/<name>", methods=["DELETE"])
-    @described(REMOVE_USER)
-    def remove_user(self, request: Request, name: str) -> Any:
-        return self._done(request, users.remove_user, name)
-
-    @app.route("/users/<name>/tokens", methods=["GET"])
-    @described(TOKENS)
-    def tokens(self, request: Request, name: str) -> Any:
-        return self._page(request, users.tokens, name)
-
-    @app.route("/tokens/<id>", methods=["DELETE"])
-    @described(REVOKE_TOKEN)
-    def revoke_token(self, request: Request, id: str) -> Any:
-        return self._done(request, users.revoke_token, id)
-
-    # --- programs -----------------------------------------------------------------------------------------
-
-    @app.route("/users/<name>/programs", methods=["GET"])
-    @described(PROGRAMS)
-    def programs(self, request: Request, name: str) -> Any:
-        return self._page(request, users.programs, name)
-
-    @app.route("/users/<name>/programs", methods=["POST"])
-    @described(NEW_PROGRAM)
-    def add_program(self, request: Request, name: str) -> Any:
-        return self._added(request, NewProgram, users.add_program, "programs", "key", name)
-
-    @app.route("/programs/<key>", methods=["DELETE"])
-    @described(REVOKE_PROGRAM)
-    def revoke_program(self, request: Request, key: str) -> Any:
-        return self._done(request, users.revoke_program, key)
+    @_delete("oauth-clients/{key}", "Revoke an OAuth client and its tokens, and close their connections")
+    async def revoke_oauth_client(self, request: ApiRequest, key: str) -> None:
+        await self._done(request, users.revoke_oauth_client, key)
 
     # --- groups -------------------------------------------------------------------------------------------
 
-    @app.route("/groups", methods=["GET"])
-    @described(GROUPS)
-    def groups(self, request: Request) -> Any:
-        return self._page(request, users.groups)
+    @_get("groups", "Groups of users")
+    async def groups(self, request: ApiRequest, query: PageQuery) -> RealmGroups:
+        return await self._read(request, RealmGroups, users.groups, query)
 
-    @app.route("/groups", methods=["POST"])
-    @described(NEW_GROUP)
-    def add_group(self, request: Request) -> Any:
-        return self._added(request, NewGroup, users.add_group, "groups", "group")
+    @_post("groups", "Add a group")
+    async def add_group(self, request: ApiRequest, body: NewGroup) -> Created[RealmGroup]:
+        return await self._added(request, RealmGroup, body, users.add_group, "groups", "group")
 
-    @app.route("/groups/<name>", methods=["GET"])
-    @described(GROUP)
-    def group(self, request: Request, name: str) -> Any:
-        return self._told(request, users.group, name)
+    @_get("groups/{name}", "One group", "the group")
+    async def group(self, request: ApiRequest, name: str) -> RealmGroup:
+        return await self._read(request, RealmGroup, users.group, name)
 
-    @app.route("/groups/<name>", methods=["DELETE"])
-    @described(REMOVE_GROUP)
-    def remove_group(self, request: Request, name: str) -> Any:
-        return self._done(request, users.remove_group, name)
+    @_delete("groups/{name}", "Remove a group with its rights")
+    async def remove_group(self, request: ApiRequest, name: str) -> None:
+        await self._done(request, users.remove_group, name)
 
-    @app.route("/groups/<name>/members/<user>", methods=["PUT"])
-    @described(JOIN)
-    def join(self, request: Request, name: str, user: str) -> Any:
-        return self._done(request, users.join, name, user)
+    @_endpoint(
+        "PUT",
+        "groups/{name}/members/{user}",
+        "Put a user into a group",
+        "the user is in the group",
+        errors=(409,),
+    )
+    async def join(self, request: ApiRequest, name: str, user: str) -> None:
+        await self._done(request, users.join, name, user)
 
-    @app.route("/groups/<name>/members/<user>", methods=["DELETE"])
-    @described(LEAVE)
-    def leave(self, request: Request, name: str, user: str) -> Any:
-        return self._done(request, users.leave, name, user)
+    @_delete("groups/{name}/members/{user}", "Take a user out of a group")
+    async def leave(self, request: ApiRequest, name: str, user: str) -> None:
+        await self._done(request, users.leave, name, user)
 
     # --- robots -------------------------------------------------------------------------------------------
 
-    @app.route("/robots", methods=["GET"])
-    @described(ROBOTS)
-    def robots(self, request: Request) -> Any:
-        return self._page(request, robots.robots)
+    @_get("robots", "Robots, enrolled or not")
+    async def robots(self, request: ApiRequest, query: PageQuery) -> RealmRobots:
+        return await self._read(request, RealmRobots, robots.robots, query)
 
-    @app.route("/robots", methods=["POST"])
-    @described(NEW_ROBOT)
-    def add_robot(self, request: Request) -> Any:
-        return self._added(request, NewRobot, self._desk.enrolling(robots.add_robot), "robots", "robot")
+    @_post("robots", "Add a robot")
+    async def add_robot(self, request: ApiRequest, body: NewRobot) -> Created[RealmNewRobot]:
+        work = self._service.with_robots_port(robots.add_robot)
+        return await self._added(request, RealmNewRobot, body, work, "robots", "robot")
 
-    @app.route("/robots/<name>", methods=["GET"])
-    @described(ROBOT)
-    def robot(self, request: Request, name: str) -> Any:
-        return self._told(request, robots.robot, name)
+    @_get("robots/{name}", "One robot", "the robot")
+    async def robot(self, request: ApiRequest, name: str) -> RealmRobot:
+        return await self._read(request, RealmRobot, robots.robot, name)
 
-    @app.route("/robots/<name>", methods=["PATCH"])
-    @described(CHANGE_ROBOT)
-    def change_robot(self, request: Request, name: str) -> Any:
-        return self._api.answer(request, self._change_robot(request, name))
-
-    async def _change_robot(self, request: Request, name: str) -> Any:
-        principal = await self._admitted(request, changes=True)
-        new = body_of(request, RobotChange)
-        description = None if new.description is UNSET else new.description
-        told = await self._desk.change(
-            principal, _address(request), robots.change_robot, name, description, seen=_seen(request)
+    @_patch("robots/{name}", "Change a robot's description", "the robot")
+    async def change_robot(self, request: ApiRequest, name: str, body: RobotChange) -> Tagged[RealmRobot]:
+        description = None if body.description is UNSET else body.description
+        seen = _seen(request)
+        return Tagged(
+            await self._change(request, RealmRobot, robots.change_robot, name, description, seen=seen)
         )
-        return changed(request, told)
 
-    @app.route("/robots/<name>", methods=["DELETE"])
-    @described(REMOVE_ROBOT)
-    def remove_robot(self, request: Request, name: str) -> Any:
-        return self._api.answer(request, self._remove_robot(request, name))
+    @_delete(
+        "robots/{name}", "Remove a robot with its keys, rights and recordings", more="Its link is closed."
+    )
+    async def remove_robot(self, request: ApiRequest, name: str) -> None:
+        await self._service.remove_robot(request.principal, request.address, name)
 
-    async def _remove_robot(self, request: Request, name: str) -> Any:
-        principal = await self._admitted(request, changes=True)
-        await self._desk.remove_robot(principal, _address(request), name)
+    @_post(
+        "robots/{name}/code",
+        "A new enrolment code of a robot",
+        "the code",
+        more="An earlier code that was not used becomes void.",
+        errors=(),
+    )
+    async def new_code(self, request: ApiRequest, name: str) -> Created[RealmCode]:
+        work = self._service.with_robots_port(robots.new_code)
+        return Created(await self._change(request, RealmCode, work, name))
 
-    @app.route("/robots/<name>/code", methods=["POST"])
-    @described(NEW_CODE)
-    def new_code(self, request: Request, name: str) -> Any:
-        return self._api.answer(request, self._new_code(request, name))
+    @_get("robots/{name}/keys", "All keys that a robot ever had")
+    async def keys(self, request: ApiRequest, name: str, query: PageQuery) -> RealmKeys:
+        return await self._read(request, RealmKeys, robots.keys, name, query)
 
-    async def _new_code(self, request: Request, name: str) -> Any:
-        principal = await self._admitted(request, changes=True)
-        work = self._desk.enrolling(robots.new_code)
-        told = await self._desk.change(principal, _address(request), work, name)
-        request.setResponseCode(201)
-        return told
-
-    @app.route("/robots/<name>/keys", methods=["GET"])
-    @described(KEYS)
-    def keys(self, request: Request, name: str) -> Any:
-        return self._page(request, robots.keys, name)
-
-    @app.route("/robots/<name>/keys/<fingerprint>", methods=["DELETE"])
-    @described(REVOKE_KEY)
-    def revoke_key(self, request: Request, name: str, fingerprint: str) -> Any:
-        return self._done(request, robots.revoke_key, name, fingerprint)
+    @_delete("robots/{name}/keys/{fingerprint}", "Revoke a key, and close the link that uses it")
+    async def revoke_key(self, request: ApiRequest, name: str, fingerprint: str) -> None:
+        await self._done(request, robots.revoke_key, name, fingerprint)
 
     # --- groups of robots ---------------------------------------------------------------------------------
 
-    @app.route("/robot-groups", methods=["GET"])
-    @described(ROBOT_GROUPS)
-    def robot_groups(self, request: Request) -> Any:
-        return self._page(request, robots.groups)
+    @_get("robot-groups", "Groups of robots")
+    async def robot_groups(self, request: ApiRequest, query: PageQuery) -> RealmRobotGroups:
+        return await self._read(request, RealmRobotGroups, robots.groups, query)
 
-    @app.route("/robot-groups", methods=["POST"])
-    @described(NEW_ROBOT_GROUP)
-    def add_robot_group(self, request: Request) -> Any:
-        return self._added(request, NewRobotGroup, robots.add_group, "robot-groups", "group")
+    @_post("robot-groups", "Add a group of robots")
+    async def add_robot_group(self, request: ApiRequest, body: NewRobotGroup) -> Created[RealmRobotGroup]:
+        return await self._added(request, RealmRobotGroup, body, robots.add_group, "robot-groups", "group")
 
-    @app.route("/robot-groups/<name>", methods=["GET"])
-    @described(ROBOT_GROUP)
-    def robot_group(self, request: Request, name: str) -> Any:
-        return self._told(request, robots.group, name)
+    @_get("robot-groups/{name}", "One group of robots", "the group")
+    async def robot_group(self, request: ApiRequest, name: str) -> RealmRobotGroup:
+        return await self._read(request, RealmRobotGroup, robots.group, name)
 
-    @app.route("/robot-groups/<name>", methods=["DELETE"])
-    @described(REMOVE_ROBOT_GROUP)
-    def remove_robot_group(self, request: Request, name: str) -> Any:
-        return self._done(request, robots.remove_group, name)
+    @_delete("robot-groups/{name}", "Remove a group; its robots stay")
+    async def remove_robot_group(self, request: ApiRequest, name: str) -> None:
+        await self._done(request, robots.remove_group, name)
 
-    @app.route("/robot-groups/<name>/members/<member>", methods=["PUT"])
-    @described(JOIN_ROBOT)
-    def join_robot(self, request: Request, name: str, member: str) -> Any:
-        return self._done(request, robots.join, name, member)
+    @_endpoint(
+        "PUT",
+        "robot-groups/{name}/members/{member}",
+        "Put a robot into a group",
+        "the robot is in the group",
+        errors=(409,),
+    )
+    async def join_robot(self, request: ApiRequest, name: str, member: str) -> None:
+        await self._done(request, robots.join, name, member)
 
-    @app.route("/robot-groups/<name>/members/<member>", methods=["DELETE"])
-    @described(LEAVE_ROBOT)
-    def leave_robot(self, request: Request, name: str, member: str) -> Any:
-        return self._done(request, robots.leave, name, member)
+    @_delete("robot-groups/{name}/members/{member}", "Take a robot out of a group")
+    async def leave_robot(self, request: ApiRequest, name: str, member: str) -> None:
+        await self._done(request, robots.leave, name, member)
 
     # --- rights -------------------------------------------------------------------------------------------
 
-    @app.route("/rights", methods=["GET"])
-    @described(RIGHTS)
-    def rights(self, request: Request) -> Any:
-        return self._page(request, robots.rights, filters=("robot", "user"))
+    @_get("rights", "Rights as they were granted", errors=(404,))
+    async def rights(self, request: ApiRequest, query: RightsQuery) -> RealmRights:
+        robot, user = (None if each is UNSET else each for each in (query.robot, query.user))
+        return await self._read(request, RealmRights, robots.rights, query, robot, user)
 
-    @app.route("/rights/<name>/<holder>", methods=["GET"])
-    @described(RIGHT)
-    def right(self, request: Request, name: str, holder: str) -> Any:
-        return self._told(request, robots.right, name, holder)
+    @_get("rights/{name}/{holder}", "One right", "the right")
+    async def right(self, request: ApiRequest, name: str, holder: str) -> RealmRight:
+        return await self._read(request, RealmRight, robots.right, name, holder)
 
-    @app.route("/rights/<name>/<holder>", methods=["PUT"])
-    @described(GRANT)
-    def grant(self, request: Request, name: str, holder: str) -> Any:
-        return self._api.answer(request, self._grant(request, name, holder))
-
-    async def _grant(self, request: Request, name: str, holder: str) -> Any:
-        principal = await self._admitted(request)
-        new = body_of(request, GrantBody)
-        self._desk.count(principal, len(new.allow) + len(new.deny))
-        given = str(new.level), new.allow, new.deny
-        told, fresh = await self._desk.change(
-            principal, _address(request), robots.grant, name, holder, *given, seen=_seen(request)
+    @_endpoint(
+        "PUT",
+        "rights/{name}/{holder}",
+        "Grant a right; it replaces the holder's right on the robot",
+        {200: "an earlier right was replaced", 201: "granted"},
+        parameters=(_NONE,),
+        if_match=True,
+        errors=(409,),
+    )
+    async def grant(
+        self, request: ApiRequest, name: str, holder: str, body: GrantBody
+    ) -> Tagged[RealmRight] | Created[RealmRight]:
+        self._service.count(request.principal, len(body.allow) + len(body.deny))
+        given = str(body.level), body.allow, body.deny
+        right, fresh = await self._change(
+            request, tuple[RealmRight, bool], robots.grant, name, holder, *given, seen=_seen(request)
         )
-        if fresh:
-            _made(request, told, "rights", told["robot"], told["holder"])
-        return changed(request, told)
+        if not fresh:
+            return Tagged(right)
+        return Created(
+            right,
+            tag_of(jsontext.encode(right)),
+            location=_location("rights", right["robot"], right["holder"]),
+        )
 
-    @app.route("/rights/<name>/<holder>", methods=["DELETE"])
-    @described(REVOKE)
-    def revoke(self, request: Request, name: str, holder: str) -> Any:
-        return self._done(request, robots.revoke, name, holder)
-
-    @app.handle_errors(HTTPException)
-    def unrouted(self, request: Request, failure: Any) -> bytes:
-        answer: bytes = self._api.unrouted(request, failure)
-        return answer
+    @_delete("rights/{name}/{holder}", "Revoke a right", more="Connections that need it are closed.")
+    async def revoke(self, request: ApiRequest, name: str, holder: str) -> None:
+        await self._done(request, robots.revoke, name, holder)
 
 
-def beside(desk: RealmService, api: Api) -> IResource:
-    """What serves ``/api/v1/realm``."""
-    resource: IResource = RealmResource(desk, api).app.resource()
-    return resource
+def _location(*names: str) -> str:
+    """The address of a new resource."""
+    return "/".join([BASE_PATH, *(quote(each, safe="@") for each in names)])
 
 
-def _made(request: Request, told: Any, *names: str) -> Any:
-    """The answer about something new, which is at the address of these names."""
-    request.setResponseCode(201)
-    request.setHeader("location", "/".join([HERE, *(quote(each, safe="@") for each in names)]))
-    return told
-
-
-def _seen(request: Request) -> Precondition:
-    """What who changes something says that he has seen of it."""
-    return Precondition(field(request, "if-match"), field(request, "if-none-match"))
-
-
-def _address(request: Request) -> str:
-    return str(getattr(request.getClientAddress(), "host", "local"))
+def _seen(request: ApiRequest) -> Precondition:
+    """The preconditions of a change."""
+    return Precondition(request.header("if-match"), request.header("if-none-match"))

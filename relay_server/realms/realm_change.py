@@ -1,4 +1,4 @@
-"""What an administrator finds and changes in his own realm; there is no other for him."""
+"""Changes by an administrator, limited to their own realm."""
 
 from __future__ import annotations
 
@@ -14,75 +14,72 @@ from relay_db.queries import GroupRecord, QuotaExceeded, RobotGroupRecord, Robot
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_server.access import BadCredentials, Principal
+from relay_server.common.etags import PreconditionFailed, check_match, tag_of
 from relay_server.realms.changes import GROUP_MARK, AuditedChange, Holder
-from relay_server.realms.limits import MOST, MOST_PATTERNS, MOST_PATTERNS_OF_A_ROBOT
-from relay_server.resources.etags import PreconditionFailed, see_match, tag_of
+from relay_server.realms.schemas import MAX_COUNTS, MAX_PATTERNS, MAX_PATTERNS_OF_A_ROBOT
 
 _Record = TypeVar("_Record")
 
 
-class Needed(Refused):
-    """The realm would have to do without the administrator who asks."""
+class LastAdministrator(Refused):
+    """The realm needs this administrator."""
 
 
 class Precondition(NamedTuple):
-    """What an administrator has seen of what he changes (RFC 9110 sections 13.1.1 and 13.1.2).
+    """The preconditions of a request (RFC 9110 sections 13.1.1 and 13.1.2).
 
-    :param match: ``If-Match``: entity tags of which it has one, or ``*``: that it is there
-    :param none: ``If-None-Match``: those of which it has none, or ``*``: that it is not there
+    :param match: ``If-Match``: entity tags of which the resource must have one, or ``*`` if it must exist
+    :param none: ``If-None-Match``: entity tags of which it must have none, or ``*`` if it must not exist
     """
 
     match: str | None = None
     none: str | None = None
 
-    def check(self, told: Mapping[str, Any] | None) -> None:
-        """See that it is still so.
+    def check(self, current: Mapping[str, Any] | None) -> None:
+        """Check the preconditions.
 
-        :param told: as it is told now; ``None``: it is not there
-        :raises NotAsBefore: it is not
+        :param current: the resource as it is now; ``None`` if it does not exist
+        :raises PreconditionFailed: they do not hold
         """
-        etag = "" if told is None else tag_of(jsontext.encode(told))
-        if self.match is not None and told is None:
-            raise PreconditionFailed("there is none of it any more; read it again")
+        etag = "" if current is None else tag_of(jsontext.encode(current))
+        if self.match is not None and current is None:
+            raise PreconditionFailed("it no longer exists; read it again")
         if self.match is not None:
-            see_match(etag, self.match)
+            check_match(etag, self.match)
         if (
             self.none is not None
-            and told is not None
+            and current is not None
             and parse_etags(self.none).contains_weak(etag.strip('"'))
         ):
-            raise PreconditionFailed("there is one by now; read it")
+            raise PreconditionFailed("it exists by now; read it")
 
 
-ANYTHING = Precondition()
-"""However it is, it is to be changed."""
+NO_PRECONDITION = Precondition()
+"""No precondition."""
 
 
-def see_administrator(principal: Principal) -> None:
-    """:raises Refused: he is none, or his token is for less"""
+def check_administrator(principal: Principal) -> None:
+    """:raises Refused: not an administrator, or the token's scope excludes it"""
     if not principal.admin:
         raise Refused(
-            "this is for administrators of the realm, by a token without a scope or with 'admin' in it"
+            "this is for administrators of the realm, with a token without a scope or with 'admin' in it"
         )
 
 
 def user_in(s: Session, realm: str, name: str) -> UserRecord:
-    """:raises NotFound: no such user in the realm"""
     return _found(queries.find_user(s, name, realm), "user")
 
 
 def group_in(s: Session, realm: str, name: str) -> GroupRecord:
-    """:raises NotFound: no such group in the realm"""
     return _found(queries.find_group(s, name, realm), "group")
 
 
 def robot_in(s: Session, realm: str, name: str) -> RobotRecord:
-    """:raises NotFound: no such robot in the realm"""
     return _found(queries.find_robot(s, name, realm), "robot")
 
 
 def holder_in(s: Session, realm: str, name: str) -> Holder:
-    """Who can have a right.
+    """A user or a group that may hold rights.
 
     :param name: of a user, or with :data:`GROUP_MARK` before it of a group
     :raises NotFound: no such user or group in the realm
@@ -93,19 +90,20 @@ def holder_in(s: Session, realm: str, name: str) -> Holder:
 
 
 def robot_group_in(s: Session, realm: str, name: str) -> RobotGroupRecord:
-    """:raises NotFound: no such group of robots in the realm"""
     return _found(queries.find_robot_group(s, name, realm), "group of robots")
 
 
 def home_robot_in(s: Session, realm: str, name: str) -> RobotRecord:
-    """:raises NotFound: no such robot in the realm
-    :raises Refused: it is shared with the realm and of another
+    """A robot that belongs to the realm itself.
+
+    :raises NotFound: no such robot in the realm
+    :raises Refused: it is shared with the realm and belongs to another one
     """
     found = robot_in(s, realm, name)
     if found.realm != realm:
         raise Refused(
-            "this robot is shared with your realm: its description, its keys, and whether it stays on the relay "
-            "are a matter of its own realm"
+            "this robot is shared with your realm: only administrators of its own realm may change its description "
+            "or keys, or remove it"
         )
     return found
 
@@ -117,27 +115,29 @@ def _found(record: _Record | None, what: str) -> _Record:
 
 
 def no_types(_: object) -> tuple[str, ...]:
-    """Of which types the members of an administrator's lists are: they have none."""
+    """The types of members of an administrator's lists: they have none."""
     return ()
 
 
 def new_name(text: str, what: str) -> str:
-    """The one form of the name of something new, which can stand in an address.
+    """The normal form of a new name that can be part of a URL.
 
-    :raises Invalid: the name can't be
+    :raises Invalid: the name is not valid
     """
     name = normal_name(text, f"name of a {what}")
     if "/" in name or name in (".", ".."):
-        raise Invalid(f"the name of a {what} stands in addresses: it has no '/' in it, and is not '{name}'")
+        raise Invalid(
+            f"the name of a {what} is part of URLs: it must not contain '/', and must not be '{name}'"
+        )
     return name
 
 
 class RealmChangeTransaction(AuditedChange):
-    """A change by an administrator of a realm, while he is one: until it is done nobody else changes anything.
+    """A change by an administrator of a realm. Other changes wait until it is done.
 
-    :param origin: his address
-    :raises BadCredentials: he can't be proved any more
-    :raises Refused: he is no administrator any more
+    :param origin: the client's address
+    :raises BadCredentials: the administrator's token has ended
+    :raises Refused: the user is no longer an administrator
     """
 
     def __init__(
@@ -147,32 +147,28 @@ class RealmChangeTransaction(AuditedChange):
         standing = queries.principals_by_ids(session, [principal.token_id], wall())
         if not standing:
             raise BadCredentials("your session was ended; log in again")
-        see_administrator(Principal.of(standing[0]))
+        check_administrator(Principal.of(standing[0]))
         self.principal = principal
         self.realm = principal.realm
 
     def user(self, name: str) -> UserRecord:
-        """:raises NotFound: no such user"""
         return user_in(self.session, self.realm, name)
 
     def group(self, name: str) -> GroupRecord:
-        """:raises NotFound: no such group"""
         return group_in(self.session, self.realm, name)
 
     def robot(self, name: str) -> RobotRecord:
-        """:raises NotFound: no such robot"""
         return robot_in(self.session, self.realm, name)
 
     def home_robot(self, name: str) -> RobotRecord:
-        """For what is a matter of the robot's own realm, whatever realms it is shared with.
+        """A robot that belongs to the realm itself, for changes that concern all realms it is shared with.
 
         :raises NotFound: no such robot
-        :raises Refused: it is shared with the realm and of another
+        :raises Refused: it is shared with the realm and belongs to another one
         """
         return home_robot_in(self.session, self.realm, name)
 
     def robot_group(self, name: str) -> RobotGroupRecord:
-        """:raises NotFound: no such group of robots"""
         return robot_group_in(self.session, self.realm, name)
 
     def holder(self, name: str) -> Holder:
@@ -181,43 +177,44 @@ class RealmChangeTransaction(AuditedChange):
         """
         return holder_in(self.session, self.realm, name)
 
-    def see_another(self, user: UserRecord, what: str) -> None:
-        """See that somebody else is meant than who asks. As he is an administrator, the realm keeps one by that.
+    def check_not_self(self, user: UserRecord, what: str) -> None:
+        """Check that a change concerns another user. Since the caller is an administrator, the realm keeps
+        one.
 
-        :param what: would be done to the user
-        :raises Needed: it is himself
+        :param what: the change, for the error
+        :raises LastAdministrator: it is the caller's own account
         """
         if user.id == self.principal.user_id:
-            raise Needed(
-                f"you can't {what} yourself, or the realm might have no administrator left: have another one do it, or "
-                "who runs 'switchboard' on the relay's machine"
+            raise LastAdministrator(
+                f"you cannot {what} yourself, since the realm might have no administrator left: ask another one, or "
+                "an operator of 'switchboard' on the relay's machine"
             )
 
-    def needs_whole(self) -> None:
-        """See that he asks by a token for all that he may: what may give somebody more is not what a scope narrows.
+    def require_full_scope(self) -> None:
+        """Check that the token has no scope: a change that may give someone more is not for narrowed tokens.
 
-        :raises Refused: by one for less
+        :raises Refused: it has one
         """
-        self.principal.needs_whole()
+        self.principal.require_full_scope()
 
-    def see_room_for_patterns(self, robot: RobotRecord, more: int) -> None:
-        """:param more: patterns that the rights on a robot are to have beside those there are
-        :raises NoRoom: there would be too many
+    def check_pattern_room(self, robot: RobotRecord, more: int) -> None:
+        """:param more: patterns to be added to the rights on a robot
+        :raises QuotaExceeded: there would be too many
         """
         if more <= 0:
             return
         all_ = queries.count_patterns(self.session, realm=self.realm)
         of_robot = queries.count_patterns(self.session, realm=self.realm, robot_id=robot.id)
-        if all_ + more > MOST_PATTERNS or of_robot + more > MOST_PATTERNS_OF_A_ROBOT:
+        if all_ + more > MAX_PATTERNS or of_robot + more > MAX_PATTERNS_OF_A_ROBOT:
             raise QuotaExceeded(
-                f"the rights in a realm have {MOST_PATTERNS} patterns at most, those on one robot "
-                f"{MOST_PATTERNS_OF_A_ROBOT}; use wildcards, or remove some first"
+                f"the rights in a realm may have {MAX_PATTERNS} patterns at most, and those on one robot "
+                f"{MAX_PATTERNS_OF_A_ROBOT}; use wildcards, or remove some first"
             )
 
-    def see_room(self, what: str) -> None:
-        """:param what: one of :data:`MOST`, of which there is to be one more
-        :raises NoRoom: there are as many as there may be
+    def check_room(self, what: str) -> None:
+        """:param what: a key of :data:`MAX_COUNTS`; one more is to be added
+        :raises QuotaExceeded: there are too many already
         """
-        if getattr(queries.realm_size(self.session, self.realm), what) >= MOST[what]:
-            words = what.replace("_", " ")
-            raise QuotaExceeded(f"a realm has {MOST[what]} {words} at most; remove some first")
+        if getattr(queries.realm_size(self.session, self.realm), what) >= MAX_COUNTS[what]:
+            words = what.replace("oauth", "OAuth").replace("_", " ")
+            raise QuotaExceeded(f"a realm may have {MAX_COUNTS[what]} {words} at most; remove some first")

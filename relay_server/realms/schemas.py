@@ -1,38 +1,75 @@
-"""The shapes of what ``realm`` takes and answers."""
+"""Limits of administration, and its requests and answers as the HTTP API has them."""
 
 from __future__ import annotations
 
-from typing import Annotated, TypedDict
+from typing import Annotated, Literal, TypedDict
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from relay_db.models import LABEL
-from relay_db.queries.realms import MOST_DAYS
+from relay_db.queries.realms import MAX_EVENT_DAYS
 from relay_db.queries.rights import PATTERNS
 from relay_protocol.rights import Level
 from relay_server.auth.passwords import MAX_BYTES
-from relay_server.realms.limits import NAME_SENT, PATTERN_SENT, SCOPE_SENT
 
-Name = Annotated[str, Meta(max_length=NAME_SENT)]
+CHANGES_PER_SECOND = 2.0
+CHANGES_BURST = 200
+"""Changes of one realm: per second in the long run, and at once. After each the relay reads the database."""
+
+PATTERNS_PER_CHANGE = 8
+"""This many patterns of a right count as one more change, since they are compiled for every connection."""
+
+PASSWORDS_AT_ONCE = 16
+"""New passwords that are hashed or wait for it. Logins wait in the same queue."""
+
+REALMS = 1000
+"""Realms whose changes are counted; those that were quiet longest are forgotten first."""
+
+MAX_NAME = 255
+"""Longest name in a request, in characters; its normal form is shorter."""
+
+MAX_PATTERN = 255
+"""Longest pattern in a request, in characters."""
+
+MAX_SCOPE = 4096
+"""Longest scope of an OAuth client in a request, in characters."""
+
+MAX_COUNTS = {
+    "users": 5000,
+    "groups": 1000,
+    "robots": 1000,
+    "memberships": 20_000,
+    "rights": 20_000,
+    "oauth_clients": 5000,
+    "robot_groups": 1000,
+    "robot_memberships": 20_000,
+}
+"""The most a realm may have over HTTP; the command line has no such limit."""
+
+MAX_PATTERNS = 2000
+MAX_PATTERNS_OF_A_ROBOT = 256
+"""Most patterns of all rights in a realm, and of those on one robot, likewise."""
+
+Name = Annotated[str, Meta(max_length=MAX_NAME)]
 Password = Annotated[str, Meta(max_length=MAX_BYTES)]
 Line = Annotated[str, Meta(max_length=LABEL)]
-Patterns = Annotated[list[Annotated[str, Meta(max_length=PATTERN_SENT)]], Meta(max_length=PATTERNS)]
+Patterns = Annotated[list[Annotated[str, Meta(max_length=MAX_PATTERN)]], Meta(max_length=PATTERNS)]
 
 
 class RealmChange(msgspec.Struct, forbid_unknown_fields=True):
-    """What is to be other than it is.
+    """A change of the realm.
 
-    :param events_days: how long the realm's memory keeps events; null: as long as the relay's
+    :param events_days: days for which events are stored; null: the relay's setting
     """
 
-    events_days: Annotated[float, Meta(gt=0, le=MOST_DAYS)] | None
+    events_days: Annotated[float, Meta(gt=0, le=MAX_EVENT_DAYS)] | None
 
 
 class NewUser(msgspec.Struct, forbid_unknown_fields=True):
-    """A user.
+    """A new user.
 
-    :param password: at least 8 characters; without one only access tokens let the user in
+    :param password: at least 8 characters; without one the user can log in by access tokens only
     :param admin: an administrator of the realm
     """
 
@@ -42,10 +79,10 @@ class NewUser(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class UserChange(msgspec.Struct, forbid_unknown_fields=True):
-    """What is to be other than it is.
+    """A change of a user. Omitted fields stay as they are.
 
-    :param password: ends the user's browser sessions, but for the one that asks
-    :param disabled: shut out at once, with all rights and tokens kept for later
+    :param password: a new password; the user's other browser sessions end
+    :param disabled: the user is shut out at once; rights and tokens are kept
     """
 
     password: Password | UnsetType = UNSET
@@ -54,13 +91,13 @@ class UserChange(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NewGroup(msgspec.Struct, forbid_unknown_fields=True):
-    """A group of users."""
+    """A new group of users."""
 
     name: Name
 
 
 class NewRobot(msgspec.Struct, forbid_unknown_fields=True):
-    """A robot.
+    """A new robot.
 
     :param description: one line for people
     """
@@ -70,7 +107,7 @@ class NewRobot(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class RobotChange(msgspec.Struct, forbid_unknown_fields=True):
-    """What is to be other than it is.
+    """A change of a robot. Omitted fields stay as they are.
 
     :param description: one line for people
     """
@@ -79,27 +116,27 @@ class RobotChange(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NewRobotGroup(msgspec.Struct, forbid_unknown_fields=True):
-    """A group of robots."""
+    """A new group of robots."""
 
     name: Name
 
 
-class NewProgram(msgspec.Struct, forbid_unknown_fields=True):
-    """A program that acts as a user.
+class NewOAuthClient(msgspec.Struct, forbid_unknown_fields=True):
+    """A new OAuth client that acts as a user.
 
     :param label: one line for people
-    :param scope: what its tokens may be used for at most; without one for all that the user may
+    :param scope: limits its tokens; without one they have all rights of the user
     """
 
     label: Line = ""
-    scope: Annotated[str, Meta(max_length=SCOPE_SENT)] | UnsetType = UNSET
+    scope: Annotated[str, Meta(max_length=MAX_SCOPE)] | UnsetType = UNSET
 
 
 class GrantBody(msgspec.Struct, forbid_unknown_fields=True):
-    """What somebody may do.
+    """A right on a robot.
 
-    :param allow: `operation:resource`, with wildcards: what is allowed beyond the level
-    :param deny: the same: what is denied in spite of the rest
+    :param allow: patterns `operation:resource`, with wildcards, that are allowed beyond the level
+    :param deny: patterns that are denied, whatever else allows them
     """
 
     level: Level
@@ -110,19 +147,19 @@ class GrantBody(msgspec.Struct, forbid_unknown_fields=True):
 class RealmAbout(TypedDict):
     """A realm.
 
-    :param users: how many there are
-    :param groups: how many there are
-    :param robots: how many there are
-    :param programs: how many all users have
-    :param robot_groups: how many there are
-    :param events_days: how long its memory keeps events; null: as long as the relay's
+    :param users: number of users
+    :param groups: number of groups of users
+    :param robots: number of robots
+    :param oauth_clients: number of OAuth clients of all users
+    :param robot_groups: number of groups of robots
+    :param events_days: days for which events are stored; null: the relay's setting
     """
 
     realm: str
     users: int
     groups: int
     robots: int
-    programs: int
+    oauth_clients: int
     robot_groups: int
     events_days: float | None
 
@@ -130,8 +167,8 @@ class RealmAbout(TypedDict):
 class RealmUser(TypedDict):
     """A user.
 
-    :param password: whether there is one
-    :param guest: whether it is that of an account elsewhere, where it is changed
+    :param password: whether the user has a password
+    :param guest: whether this is a linked account: its password belongs to an account in another realm
     """
 
     user: str
@@ -145,7 +182,7 @@ class RealmUser(TypedDict):
 class RealmUsers(TypedDict):
     """A page of users.
 
-    :param next: the name behind which there is more, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
     users: list[RealmUser]
@@ -162,7 +199,7 @@ class RealmGroup(TypedDict):
 class RealmGroups(TypedDict):
     """A page of groups.
 
-    :param next: the name behind which there is more, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
     groups: list[RealmGroup]
@@ -172,8 +209,8 @@ class RealmGroups(TypedDict):
 class RealmRobot(TypedDict):
     """A robot.
 
-    :param keys: how many of its keys are live; 0: it is not enrolled
-    :param guest: whether it is another realm's, and shared with this one
+    :param keys: number of valid keys; 0: it is not enrolled
+    :param guest: whether it belongs to another realm and is shared with this one
     """
 
     robot: str
@@ -185,7 +222,7 @@ class RealmRobot(TypedDict):
 class RealmRobots(TypedDict):
     """A page of robots.
 
-    :param next: the name behind which there is more, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
     robots: list[RealmRobot]
@@ -195,9 +232,9 @@ class RealmRobots(TypedDict):
 class RealmNewRobot(TypedDict):
     """A robot that was added.
 
-    :param enrolment_code: is told this once
-    :param expires_in: seconds for which the code is good
-    :param robots_port: the port of the relay at which robots dial
+    :param enrolment_code: shown only in this answer
+    :param expires_in: seconds for which the code is valid
+    :param robots_port: the port of the relay that robots dial
     """
 
     robot: str
@@ -212,9 +249,9 @@ class RealmNewRobot(TypedDict):
 class RealmCode(TypedDict):
     """A code with which a robot enrols.
 
-    :param enrolment_code: is told this once
-    :param expires_in: seconds for which the code is good
-    :param robots_port: the port of the relay at which robots dial
+    :param enrolment_code: shown only in this answer
+    :param expires_in: seconds for which the code is valid
+    :param robots_port: the port of the relay that robots dial
     """
 
     robot: str
@@ -224,7 +261,7 @@ class RealmCode(TypedDict):
 
 
 class RealmRobotGroup(TypedDict):
-    """A group of robots and what is in it."""
+    """A group of robots with its members."""
 
     group: str
     robots: list[str]
@@ -233,7 +270,7 @@ class RealmRobotGroup(TypedDict):
 class RealmRobotGroups(TypedDict):
     """A page of groups of robots.
 
-    :param next: the name behind which there is more, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
     robot_groups: list[RealmRobotGroup]
@@ -243,9 +280,9 @@ class RealmRobotGroups(TypedDict):
 class RealmKey(TypedDict):
     """A key of a robot.
 
-    :param agent: what the robot said that it runs
+    :param agent: software that the robot reported
     :param created: Unix seconds
-    :param retired: Unix seconds; null while it is live
+    :param retired: Unix seconds; null while it is valid
     """
 
     fingerprint: str
@@ -257,7 +294,7 @@ class RealmKey(TypedDict):
 class RealmKeys(TypedDict):
     """A page of keys.
 
-    :param next: the fingerprint behind which there is more, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
     keys: list[RealmKey]
@@ -265,7 +302,7 @@ class RealmKeys(TypedDict):
 
 
 class RealmRight(TypedDict):
-    """A right as it was given.
+    """A right as it was granted.
 
     :param holder: a user, or `@` and a group
     """
@@ -280,7 +317,7 @@ class RealmRight(TypedDict):
 class RealmRights(TypedDict):
     """A page of rights.
 
-    :param next: what goes on after these as ``after``, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
     rights: list[RealmRight]
@@ -288,16 +325,15 @@ class RealmRights(TypedDict):
 
 
 class RealmToken(TypedDict):
-    """A token, without what it could be used by.
+    """A token, without the secret itself.
 
-    :param kind: ``access``, ``session`` or ``login``
     :param created: Unix seconds
     :param expires: Unix seconds; null: never
-    :param scope: null: for all that the user may
+    :param scope: null: all rights of the user
     """
 
     id: str
-    kind: str
+    kind: Literal["access", "session", "login", "foxglove"]
     label: str
     created: float
     expires: float | None
@@ -307,18 +343,18 @@ class RealmToken(TypedDict):
 class RealmTokens(TypedDict):
     """A page of tokens.
 
-    :param next: the id behind which there is more, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
     tokens: list[RealmToken]
     next: str
 
 
-class RealmProgram(TypedDict):
-    """A program, without its secret.
+class RealmOAuthClient(TypedDict):
+    """An OAuth client, without its secret.
 
     :param created: Unix seconds
-    :param scope: null: for all that the user may
+    :param scope: null: all rights of the user
     """
 
     key: str
@@ -327,20 +363,20 @@ class RealmProgram(TypedDict):
     scope: str | None
 
 
-class RealmPrograms(TypedDict):
-    """A page of programs.
+class RealmOAuthClients(TypedDict):
+    """A page of OAuth clients.
 
-    :param next: the key behind which there is more, or empty
+    :param next: ``after`` of the next page, empty on the last one
     """
 
-    programs: list[RealmProgram]
+    oauth_clients: list[RealmOAuthClient]
     next: str
 
 
-class RealmNewProgram(RealmProgram):
-    """A program that was added.
+class RealmNewOAuthClient(RealmOAuthClient):
+    """An OAuth client that was added.
 
-    :param secret: is told this once
+    :param secret: shown only in this answer
     """
 
     secret: str

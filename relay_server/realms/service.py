@@ -1,4 +1,4 @@
-"""Whom administrators ask over HTTP: each for his own realm, and what he changed holds before he is answered."""
+"""Administration of realms over HTTP. A change is in effect before its response is sent."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from twisted.logger import Logger
 
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_server.access import Principal
-from relay_server.common.clock import shield
+from relay_server.common.concurrency import shield
 from relay_server.common.database import AsyncDatabase
 from relay_server.common.token_bucket import Buckets
 from relay_server.realms import robots
-from relay_server.realms.limits import (
-    CHANGES_A_SECOND,
-    CHANGES_AT_ONCE,
+from relay_server.realms.realm_change import RealmChangeTransaction, check_administrator
+from relay_server.realms.schemas import (
+    CHANGES_BURST,
+    CHANGES_PER_SECOND,
     PASSWORDS_AT_ONCE,
-    PATTERNS_A_CHANGE,
+    PATTERNS_PER_CHANGE,
     REALMS,
 )
-from relay_server.realms.realm_change import RealmChangeTransaction, see_administrator
 from relay_server.recordings.recordings import Recordings
 
 P = ParamSpec("P")
@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 class TooManyChanges(Refused):
-    """A realm is changed too much; this may be tried again after ``retry_after`` seconds."""
+    """A realm is changed too often; try again after ``retry_after`` seconds."""
 
     code = "too_often"
 
@@ -40,18 +40,18 @@ class TooManyChanges(Refused):
         self.retry_after = retry_after
 
 
-class Hashing(Protocol):
-    """Who hashes passwords; see :class:`relay_server.auth.authenticator.Authenticator`."""
+class PasswordHasher(Protocol):
+    """Hashes passwords; see :class:`relay_server.auth.authenticator.Authenticator`."""
 
     async def new_hash(self, password: str) -> str:
-        """What may be stored of a new password."""
+        """The hash to store for a new password."""
 
 
 class RealmService:
-    """See the module's text. The functions it carries out are those of ``people`` and ``machines``.
+    """Runs the functions of :mod:`~relay_server.realms.users` and :mod:`~relay_server.realms.robots`.
 
-    :param take_up: has the relay look at the database; what was revoked is cut then
-    :param robots_port: where robots dial
+    :param apply: applies changes of the database in the relay, so that revoked connections are closed
+    :param robots_port: the port that robots dial
     :param wall: Unix time in seconds
     :param seconds: a monotonic clock
     """
@@ -61,9 +61,9 @@ class RealmService:
     def __init__(
         self,
         store: AsyncDatabase,
-        hashing: Hashing,
+        hashing: PasswordHasher,
         recordings: Recordings,
-        take_up: Callable[[], Awaitable[None]],
+        apply: Callable[[], Awaitable[None]],
         robots_port: Callable[[], int],
         wall: Callable[[], float] = time.time,
         seconds: Callable[[], float] = time.monotonic,
@@ -71,31 +71,31 @@ class RealmService:
         self._store = store
         self._hashing = hashing
         self._recordings = recordings
-        self._take_up = take_up
+        self._apply = apply
         self._robots_port = robots_port
         self._wall = wall
         self._passwords = 0
-        self._realms = Buckets(CHANGES_A_SECOND, CHANGES_AT_ONCE, REALMS, seconds)
-        # Nobody uses up alone what others need to shut him out.
-        self._tokens = Buckets(CHANGES_A_SECOND / 2, CHANGES_AT_ONCE / 2, REALMS, seconds)
+        self._realms = Buckets(CHANGES_PER_SECOND, CHANGES_BURST, REALMS, seconds)
+        # No administrator can use up alone what others need to lock them out.
+        self._tokens = Buckets(CHANGES_PER_SECOND / 2, CHANGES_BURST / 2, REALMS, seconds)
 
     def admit(self, principal: Principal, *, changes: bool = False) -> None:
-        """Let an administrator in.
+        """Check that the caller is an administrator.
 
-        :param changes: he is about to change something, which is counted
-        :raises Refused: he is none, or the realm is changed too much
+        :param changes: a change follows, which is counted
+        :raises Refused: not an administrator, or the realm is changed too often
         """
-        see_administrator(principal)
+        check_administrator(principal)
         if changes:
             self.count(principal)
 
     def count(self, principal: Principal, patterns: int = 0) -> None:
-        """Count a change that somebody who was admitted is about to make.
+        """Count a change of an administrator.
 
-        :param patterns: of a right that he gives
-        :raises Refused: the realm is changed too much; then nothing is counted
+        :param patterns: of a right to be granted
+        :raises Refused: the realm is changed too often; then nothing is counted
         """
-        cost = 1 + patterns / PATTERNS_A_CHANGE
+        cost = 1 + patterns / PATTERNS_PER_CHANGE
         own, all_ = self._tokens.of(principal.token_id), self._realms.of(principal.realm)
         wait = max(own.wait_for(cost), all_.wait_for(cost))
         if wait > 0:
@@ -110,24 +110,24 @@ class RealmService:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Look at the realm of somebody who was admitted.
+        """Read from the realm of an administrator.
 
-        :param query: gets a session and the name of the realm before its arguments
-        :raises Unavailable: the database can't be asked
+        :param query: gets a session and the realm's name before its arguments
+        :raises Unavailable: the database cannot be asked
         """
         return await self._store.read(query, principal.realm, *args, **kwargs)
 
     async def new_hash(self, principal: Principal, password: str) -> str:
-        """What may be stored of a new password that somebody gives who was admitted.
+        """The hash of a new password that an administrator sets.
 
-        :raises Refused: his token is not for this
+        :raises Refused: the token does not allow it
         :raises Invalid: it breaks the rules
-        :raises Unavailable: too many are hashed now
+        :raises Unavailable: too many are being hashed
         """
-        principal.needs_whole()
+        principal.require_full_scope()
         if self._passwords >= PASSWORDS_AT_ONCE:
-            raise Unavailable("too many passwords are set now; try again in a moment")
-        # A thread hashes on when who asked has left: the place is taken for as long.
+            raise Unavailable("too many passwords are being set; try again in a moment")
+        # The thread continues after the client has disconnected, and keeps its slot.
         return await shield(Deferred.fromCoroutine(self._hash(password)))
 
     async def _hash(self, password: str) -> str:
@@ -145,40 +145,40 @@ class RealmService:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Change the realm of somebody who was admitted, and have the relay go by it: also when he does not wait.
+        """Change the realm of an administrator, and apply it in the relay, even if the client has disconnected.
 
-        :param origin: his address
-        :raises SwitchboardError: it can't be done, and nothing was
+        :param origin: the client's address
+        :raises SwitchboardError: it was not possible, and nothing was changed
         """
 
         def carry_out(session: Session) -> T:
             return work(RealmChangeTransaction(session, principal, origin, self._wall), *args, **kwargs)
 
-        return await shield(Deferred.fromCoroutine(self._changed(carry_out)))
+        return await shield(Deferred.fromCoroutine(self._write_and_apply(carry_out)))
 
-    def enrolling(
+    def with_robots_port(
         self, work: Callable[Concatenate[RealmChangeTransaction, P], dict[str, Any]]
     ) -> Callable[Concatenate[RealmChangeTransaction, P], dict[str, Any]]:
-        """Work that gives a robot a code; told with it is at which port of the relay it enrols."""
+        """Wraps work that makes an enrolment code: its result also names the port that robots dial."""
 
         def carry_out(change: RealmChangeTransaction, /, *args: P.args, **kwargs: P.kwargs) -> dict[str, Any]:
             return {**work(change, *args, **kwargs), "robots_port": self._robots_port()}
 
         return carry_out
 
-    async def _changed(self, work: Callable[[Session], T]) -> T:
+    async def _write_and_apply(self, work: Callable[[Session], T]) -> T:
         result = await self._store.write(work)
         try:
-            await self._take_up()
+            await self._apply()
         except SwitchboardError as error:
-            # It is done all the same, and the relay looks again by itself.
-            self.log.error("a change is taken up later: {reason}", reason=str(error))
+            # The change is stored all the same, and the relay reads it by itself later.
+            self.log.error("a change takes effect later: {reason}", reason=str(error))
         except Exception:
-            self.log.failure("a change is taken up later")
+            self.log.failure("a change takes effect later")
         return result
 
     async def remove_robot(self, principal: Principal, origin: str, name: str) -> Any:
-        """The robot with its keys and all rights on it; the relay deletes what is recorded of it.
+        """Remove a robot with its keys and all rights on it; the relay deletes its recordings.
 
         :raises NotFound: no such robot
         :raises SwitchboardError: as :meth:`change`

@@ -1,4 +1,4 @@
-"""The recordings of a relay as files: each a ``.mcap``, and beside it a ``.json`` that says what it is."""
+"""The recordings of a relay as files: each is a ``.mcap`` with a ``.json`` that describes it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import enum
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -14,18 +14,22 @@ from twisted.logger import Logger
 
 from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_protocol.realms import DEFAULT_REALM, full_name
+from relay_protocol.rights import Operation
+from relay_server.access import Permit
+from relay_server.files.object_storage import ObjectStorage
+from relay_server.files.storage import FileStorage, LocalContent, StoredContent
 
 KEPT = 10_000
 ROBOT_KEPT = 1000
-"""Recordings that may be kept in all, and of one robot, however small they are."""
+"""Most recordings in all, and of one robot, whatever their size."""
 
 SMALLEST = 10**6
 """Bytes that every recording may have."""
 
 NO_ROOM_NOW = "there is no room for such a recording on this relay now"
-"""All that a realm is told where the recordings of others are in the way."""
+"""The answer where recordings of other realms take the room."""
 
-UNKNOWN = "there is no such recording, or it holds what you may not record and see"
+UNKNOWN = "there is no such recording, or it contains topics or cameras that you have no right to"
 
 
 class RecordingState(enum.Enum):
@@ -33,12 +37,12 @@ class RecordingState(enum.Enum):
 
     RECORDING = "recording"
     FINISHING = "finishing"
-    """No more comes; what waits is being written."""
+    """It takes no more samples; the queued ones are being written."""
     COMPLETE = "complete"
     INCOMPLETE = "incomplete"
-    """It broke off, and the file can't be read yet."""
+    """It broke off, and the file cannot be read yet."""
     RECOVERED = "recovered"
-    """It broke off; what was on the disk by then can be read."""
+    """It broke off; the part on the disk can be read."""
 
 
 READABLE = frozenset({RecordingState.COMPLETE, RecordingState.RECOVERED})
@@ -49,17 +53,17 @@ class RecordingEntry(msgspec.Struct):
     """One recording.
 
     :param robot_id: numbers of robots are never used again
-    :param pictures: those of the topics that may carry what a camera sees
+    :param pictures: the topics that may carry camera images
     :param begun: Unix seconds
     :param ended: Unix seconds
     :param reason: why it ended
-    :param limit: bytes the file may have
-    :param seconds: it may take
-    :param bytes: of the file
-    :param drops: messages that came and are not in it
-    :param problems: what was not recorded as it was wanted, in words
-    :param realm: of the user: there it is kept, and takes room
-    :param home: the robot's own realm, where that is another
+    :param limit: largest size of the file in bytes
+    :param seconds: longest duration
+    :param bytes: size of the file
+    :param drops: messages that came and are not in the file
+    :param problems: parts that could not be recorded as requested, in words
+    :param realm: of the user; the recording belongs to it and counts for it
+    :param home: the robot's own realm, if that is another one
     """
 
     id: str
@@ -85,20 +89,19 @@ class RecordingEntry(msgspec.Struct):
 
     @property
     def robot_full(self) -> str:
-        """The robot's name for the whole relay."""
         return full_name(self.robot, self.home or self.realm)
 
 
 FOLDER = "recordings"
-"""Where they are, in the relay's data folder."""
+"""Their folder in the relay's data folder."""
 
 _decoder = msgspec.json.Decoder(RecordingEntry)
 
 
 def entries_in(folder: Path) -> Iterator[tuple[str, RecordingEntry | None]]:
-    """The recordings of a folder, which is only read: the name of each ``.json``, and what it says.
+    """Read the recordings of a folder: the name of each ``.json`` and its contents.
 
-    :raises OSError: it can't be read
+    :raises OSError: it cannot be read
     """
     for path in folder.glob("*.json"):
         try:
@@ -106,52 +109,72 @@ def entries_in(folder: Path) -> Iterator[tuple[str, RecordingEntry | None]]:
         except (msgspec.MsgspecError, UnicodeDecodeError):
             yield path.name, None
         except FileNotFoundError:
-            # A relay that runs has deleted it meanwhile.
+            # A running relay has deleted it meanwhile.
             continue
 
 
 def kept_of(folder: Path, robot_id: int) -> tuple[int, int]:
     """How many recordings of a robot a folder has, and the bytes of their files.
 
-    :raises OSError: it can't be read
+    :raises OSError: it cannot be read
     """
     count = size = 0
     for _, entry in entries_in(folder):
         if entry is not None and entry.robot_id == robot_id:
             count += 1
-            with contextlib.suppress(FileNotFoundError):
+            try:
                 size += _file(folder, entry.id).stat().st_size
+            except FileNotFoundError:
+                # It is in the storage, or was never written.
+                size += entry.bytes if entry.state in READABLE else 0
     return count, size
 
 
 def _file(folder: Path, id: str) -> Path:
-    return folder / f"{id}.mcap"
+    return folder / _file_name(id)
+
+
+def _file_name(id: str) -> str:
+    return f"{id}.mcap"
+
+
+def open_storage(url: str) -> FileStorage | None:
+    """The storage of finished recordings: a folder in that of files. ``None``: they stay on the relay's disk.
+
+    :param url: of the S3-compatible storage of files, or empty
+    :raises Invalid: the URL can't be used
+    """
+    return ObjectStorage(f"{url.rstrip('/')}/{FOLDER}", _file_name) if url else None
 
 
 class Library:
-    """The folder of recordings. What is in it is read once, by :meth:`open`.
+    """The folder of recordings. Its contents are read once, by :meth:`open`.
 
-    Each realm has all the room there is, as far as others leave it, and is told of nobody's recordings but its own.
+    Each realm may use all the space that others leave, and sees only its own recordings.
 
-    :param quota: bytes all recordings together may have
-    :param reserve: bytes of the disk that stay free; other things of the relay are on it too
-    :ivar copied: the recording that takes its room twice, while its file is mended
+    :param quota: bytes of all recordings together
+    :param reserve: bytes of the disk that stay free, also for other data of the relay
+    :param storage: of finished recordings; without one they stay in the folder
+    :ivar copied: the recording that takes its space twice while its file is repaired
     """
 
     log = Logger()
 
-    def __init__(self, folder: Path, quota: int, reserve: int = 0) -> None:
+    def __init__(
+        self, folder: Path, quota: int, reserve: int = 0, storage: FileStorage | None = None
+    ) -> None:
         self._folder = folder
         self.quota = quota
         self.reserve = reserve
+        self._storage = storage
         self.copied: RecordingEntry | None = None
         self._entries: dict[str, RecordingEntry] = {}
         self._robots: dict[int, dict[str, RecordingEntry]] = {}
 
     def open(self) -> None:
-        """Find out what is there.
+        """Read the folder.
 
-        :raises Invalid: the folder can't be used
+        :raises Invalid: it cannot be used
         """
         try:
             self._folder.mkdir(mode=0o700, exist_ok=True)
@@ -160,58 +183,54 @@ class Library:
             for name, entry in entries_in(self._folder):
                 self._read(name, entry)
         except OSError as error:
-            raise Invalid(f"the folder of recordings can't be used: {error.strerror}") from None
+            raise Invalid(f"the folder of recordings cannot be used: {error.strerror}") from None
 
     def _read(self, name: str, entry: RecordingEntry | None) -> None:
         if entry is None:
-            self.log.error("{file} in the folder of recordings is not understood", file=name)
+            self.log.error("{file} in the folder of recordings is not valid", file=name)
             return
         if entry.state in RUNNING:
             entry.state = RecordingState.INCOMPLETE
-            entry.reason = "the relay ended without warning"
+            entry.reason = "the relay ended unexpectedly"
         if entry.state is RecordingState.INCOMPLETE:
-            # Nobody came to write down how large it became.
+            # The relay died before it could store the size.
             entry.bytes = self.size(entry)
         self._keep(entry)
 
-    # --- what is there ------------------------------------------------------------------------------------
+    # --- contents -----------------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[RecordingEntry]:
         return iter(list(self._entries.values()))
 
     def of(self, robot_id: int) -> list[RecordingEntry]:
-        """A robot's recordings, the latest first: in the order of :func:`place`, backwards."""
+        """A robot's recordings, the latest first (:func:`place`, reversed)."""
         return sorted(self._robots.get(robot_id, {}).values(), key=place, reverse=True)
 
     def find(self, robot_id: int, id: str) -> RecordingEntry:
-        """One recording of a robot.
-
-        :raises NotFound: there is none
-        """
         entry = self._entries.get(id)
         if entry is None or entry.robot_id != robot_id:
             raise NotFound(UNKNOWN)
         return entry
 
     def has(self, entry: RecordingEntry) -> bool:
-        """Whether it is still there."""
+        """Whether the recording still exists."""
         return entry.id in self._entries
 
     def incomplete(self) -> list[RecordingEntry]:
-        """Those whose file can't be read yet."""
+        """Recordings whose file cannot be read yet."""
         return [entry for entry in self._entries.values() if entry.state is RecordingState.INCOMPLETE]
 
     @property
     def used(self) -> int:
-        """Bytes that are taken, with all that is being recorded may still become."""
+        """Bytes in use, including all that running recordings may still take."""
         return self._taken()
 
     def left(self, realm: str) -> int:
-        """Bytes that one more of a realm may take, if only those of its own are counted."""
+        """Bytes that one more recording of a realm may take, counting only those of that realm."""
         return max(0, self.quota - self._taken(realm))
 
     def _taken(self, realm: str | None = None) -> int:
-        """By one realm, or by all."""
+        """Bytes of one realm, or of all."""
         copied = () if self.copied is None else (self.copied,)
         return sum(
             entry.limit if entry.state in RUNNING else entry.bytes
@@ -220,27 +239,25 @@ class Library:
         )
 
     def full(self, robot_id: int, realm: str) -> str:
-        """Why there can't be one more of a robot of this realm, however small; empty when there can."""
+        """Why there cannot be one more recording of a robot in this realm, whatever its size; empty if there
+        can."""
         if sum(each.realm == realm for each in self._robots.get(robot_id, {}).values()) >= ROBOT_KEPT:
-            return (
-                f"{ROBOT_KEPT} recordings of this robot are kept, the most there may be: delete some of them"
-            )
+            return f"{ROBOT_KEPT} recordings of this robot are stored, the most there may be: delete some of them"
         if sum(entry.realm == realm for entry in self._entries.values()) >= KEPT:
-            return f"{KEPT} recordings are kept, the most there may be in all: delete some, of any robot"
+            return f"{KEPT} recordings are stored, the most there may be in all: delete some, of any robot"
         if len(self._entries) >= KEPT or self.left(realm) >= SMALLEST > self.quota - self.used:
             return NO_ROOM_NOW
         return ""
 
     def path(self, entry: RecordingEntry) -> Path:
-        """The file."""
         return _file(self._folder, entry.id)
 
     # --- changes; the reactor's thread --------------------------------------------------------------------
 
     def add(self, entry: RecordingEntry) -> None:
-        """One more.
+        """Add a recording.
 
-        :raises Unavailable: it would be one too many, or could become more than there may be
+        :raises Unavailable: there are too many, or it could become too large
         """
         full = self.full(entry.robot_id, entry.realm)
         if full:
@@ -248,7 +265,7 @@ class Library:
         left = self.left(entry.realm)
         if entry.limit > left:
             raise Unavailable(
-                f"recordings may have {self.quota // 10**6} MB in all, of which {left // 10**6} MB "
+                f"recordings may take {self.quota // 10**6} MB in all, of which {left // 10**6} MB "
                 f"are left: delete some, or record at most that much"
             )
         if entry.limit > self.quota - self.used:
@@ -256,7 +273,7 @@ class Library:
         self._keep(entry)
 
     def forget(self, entry: RecordingEntry) -> None:
-        """It is there no more."""
+        """Remove a recording from the list."""
         self._entries.pop(entry.id, None)
         others = self._robots.get(entry.robot_id, {})
         others.pop(entry.id, None)
@@ -272,32 +289,67 @@ class Library:
     def size(self, entry: RecordingEntry) -> int:
         """Bytes of the file, 0 if there is none.
 
-        :raises OSError: it can't be looked at
+        :raises OSError: it cannot be read
         """
         try:
             return self.path(entry).stat().st_size
         except FileNotFoundError:
             return 0
 
-    def spare(self) -> int:
-        """Bytes of the disk that are free beyond the reserve; less than 0 when it is nearly full.
+    @property
+    def has_storage(self) -> bool:
+        """Whether finished recordings are moved into a storage."""
+        return self._storage is not None
 
-        :raises OSError: it can't be looked at
+    def on_disk(self) -> set[str]:
+        """Recordings whose files are on the relay's disk.
+
+        :raises OSError: it cannot be read
+        """
+        return {path.stem for path in self._folder.glob("*.mcap")}
+
+    def move(self, entry: RecordingEntry, stopping: Callable[[], bool]) -> None:
+        """Move a finished recording into the storage, if it is not there yet. Its description must be saved.
+
+        :param stopping: see :meth:`FileStorage.store`
+        :raises OSError: it cannot be moved, or that was stopped; the file is still on the disk
+        """
+        path = self.path(entry)
+        if self._storage is not None and path.exists():
+            self._storage.store(path, entry.id, stopping)
+
+    def open_content(self, entry: RecordingEntry) -> StoredContent:
+        """Open the file of a finished recording for reading, wherever it is.
+
+        :raises OSError: it cannot be opened
+        """
+        try:
+            return LocalContent(self.path(entry))
+        except FileNotFoundError:
+            if self._storage is None:
+                raise
+            # It leaves the disk only once it is in the storage.
+            return self._storage.open(entry.id)
+
+    def spare(self) -> int:
+        """Bytes of the disk that are free beyond the reserve; negative when it is nearly full.
+
+        :raises OSError: it cannot be read
         """
         return shutil.disk_usage(self._folder).free - self.reserve
 
     def nearly_full(self) -> bool:
-        """Whether less of the disk is free than shall stay so.
+        """Whether less than the reserve is free.
 
-        :raises OSError: it can't be looked at
+        :raises OSError: it cannot be read
         """
         return self.spare() < 0
 
     def save(self, id: str, text: bytes) -> None:
-        """Put on the disk what a recording is.
+        """Write the description of a recording to the disk.
 
         :param text: by :func:`text_of`
-        :raises OSError: it can't be written
+        :raises OSError: it cannot be written
         """
         path = self._folder / f"{id}.json"
         fresh = path.with_suffix(".new")
@@ -308,9 +360,18 @@ class Library:
         fresh.replace(path)
 
     def delete(self, id: str) -> None:
-        """Take a recording off the disk: the file first, so that none is left that nobody knows of.
+        """Delete a recording: its contents first, so that no unknown file is left behind.
 
-        :raises OSError: it can't be deleted
+        :raises OSError: it cannot be deleted
+        """
+        if self._storage is not None:
+            self._storage.delete(id)
+        self.discard(id)
+
+    def discard(self, id: str) -> None:
+        """Delete a recording that is on the disk only.
+
+        :raises OSError: it cannot be deleted
         """
         for suffix in (".mcap", ".json"):
             with contextlib.suppress(FileNotFoundError):
@@ -318,10 +379,31 @@ class Library:
 
 
 def place(entry: RecordingEntry) -> tuple[float, str]:
-    """Where a recording stands among others: when it was begun, in Unix seconds, and its id."""
+    """The order of recordings: Unix seconds of the beginning, and the id."""
     return entry.begun, entry.id
 
 
 def text_of(entry: RecordingEntry) -> bytes:
-    """What :meth:`Library.save` writes."""
+    """The bytes that :meth:`Library.save` writes."""
     return msgspec.json.encode(entry)
+
+
+def why_not(permit: Permit, see: Operation, name: str) -> str:
+    """Why a topic or camera may not be recorded; empty if it may.
+
+    :param see: the right needed to see it
+    """
+    for operation in (Operation.RECORD, see):
+        decision = permit.decide(operation, name)
+        if not decision.allowed:
+            return decision.reason
+    return ""
+
+
+def why_denied(permit: Permit, entry: RecordingEntry) -> str:
+    """Why a recording may not be read; empty if it may. All that it contains must be allowed."""
+    if permit.principal.realm != entry.realm:
+        return "it was recorded in another realm"
+    asked = [(Operation.SUBSCRIBE, topic) for topic in entry.topics]
+    asked += [(Operation.VIEW, each) for each in (*entry.cameras, *entry.pictures)]
+    return next((reason for see, name in asked if (reason := why_not(permit, see, name))), "")

@@ -1,7 +1,7 @@
-"""One MCAP file: begun, filled up to a limit, finished; and what is left of one that was not finished.
+"""MCAP files: writing one up to a size limit, and repairing one that was not finished.
 
-Source: the MCAP format specification and its registry (mcap.dev/spec), profile ``ros2``; for what ``ros2 bag`` wants of
-channels, rosbag2_storage (``qos.cpp``) and rosbag2_storage_mcap (``mcap_storage.cpp``).
+Sources: the MCAP format specification and its registry (mcap.dev/spec), profile ``ros2``; for what ``ros2
+bag`` expects of channels, rosbag2_storage (``qos.cpp``) and rosbag2_storage_mcap (``mcap_storage.cpp``).
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ from relay_protocol.limits import KIB, MIB
 from relay_server import VERSION
 
 CHUNK_BYTES = 512 * KIB
-"""Messages are compressed together by so many bytes, or more in a large file."""
+"""Messages are compressed together in chunks of this size, or larger ones in a large file."""
 
 CHUNKS = 16 * KIB
-"""A file has not many more chunks by its size than this: the index of each is in memory until the end."""
+"""A file has about this many chunks at most: the index of each stays in memory until the end."""
 
 RECORD_BYTES = 64 * MIB
-"""No record of ours is larger; a length beyond it is damage."""
+"""Our records are never larger; a greater length is damage."""
 
 _PER_MESSAGE = 64
-"""Bytes around a message and for its place in the indexes, at most."""
+"""Most bytes that a message takes beside its body, including the indexes."""
 
 _PER_CHUNK = 256
 _PER_CHUNK_AND_TRACK = 32
-"""Bytes around a chunk and in the summary about it, at most, and those for each track in it."""
+"""Most bytes that a chunk takes beside its messages, including the summary, and those for each channel in it.
+"""
 
 _END = 16 * KIB
-"""Bytes of what stands once in a file; and what a chunk that can't be compressed takes more."""
+"""Bytes of parts that occur once in a file, and of the growth of a chunk that cannot be compressed."""
 
 
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
@@ -54,19 +55,19 @@ LATCHED = f"""\
 """
 """The offer of a publisher that is reliable and transient local, in the numbers of ``rmw/types.h``.
 
-``ros2 bag play`` must offer the same, or who waits for a map or a static transform does not get it. Numbers are read by
-all versions of rosbag2, names by later ones only.
+``ros2 bag play`` must offer the same, otherwise subscribers of a map or a static transform do not get it. All
+versions of rosbag2 read numbers; only later ones read names.
 """
 
 ROSBAG2 = "rosbag2"
-"""A metadata record of this name, without more in it, tells versions that read both to expect numbers."""
+"""An empty metadata record of this name shows versions that read both that numbers are used."""
 
 
 class McapChannel(NamedTuple):
-    """What is the same for many messages of one topic.
+    """Properties that all messages of one topic share.
 
     :param encoding: of the messages, ``cdr`` or ``json``
-    :param definition: the text of the type with all it contains; empty where messages are JSON
+    :param definition: the text of the type with all types it contains; empty for JSON messages
     :param latched: publishers keep their last messages for late joiners
     """
 
@@ -78,12 +79,12 @@ class McapChannel(NamedTuple):
 
     @property
     def offered(self) -> str:
-        """What publishers offer, as rosbag2 keeps it; nothing for what is usual, which it assumes then."""
+        """The publishers' offer as rosbag2 stores it; empty for the default offer."""
         return LATCHED if self.latched else ""
 
 
 def chunk_bytes(size: int) -> int:
-    """How large the chunks are of a file that may have so many bytes."""
+    """Size of the chunks of a file that may have so many bytes."""
     return max(CHUNK_BYTES, size // CHUNKS)
 
 
@@ -92,11 +93,11 @@ class McapFileFull(Exception):
 
 
 class McapFile:
-    """A file that is being written. It is readable only when it is finished.
+    """A file that is being written. It can be read only when it is finished.
 
     :param stream: an empty file
-    :param limit: bytes the whole file may have
-    :param ros: whether messages are those of ROS 2
+    :param limit: bytes of the whole file
+    :param ros: whether messages are ROS 2 messages
     """
 
     def __init__(self, stream: BinaryIO, limit: int, ros: bool) -> None:
@@ -114,18 +115,18 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Bytes in the file, and those that will be soon."""
+        """Bytes in the file, including those that will be written at the end."""
         return self._written + self._pending
 
     def add(self, track: McapChannel, log_time: int, publish_time: int, body: bytes) -> None:
-        """One message.
+        """Add a message.
 
         :param log_time: nanoseconds
         :param publish_time: nanoseconds
-        :raises Full: it would make the file too large
-        :raises OSError: the file can't be written
+        :raises McapFileFull: it would make the file too large
+        :raises OSError: the file cannot be written
         """
-        # A new track stands twice: where it is first used, and in the summary.
+        # A new channel is written twice: where it is first used, and in the summary.
         fresh = 0 if track in self._channels else 2 * (len(str(track)) + len(track.offered) + _PER_MESSAGE)
         if self.size + self._summary + fresh + len(body) + _PER_MESSAGE > self._limit:
             raise McapFileFull
@@ -137,12 +138,12 @@ class McapFile:
         self._settle()
 
     def flush(self) -> None:
-        """Give all to the operating system, so that it is there whatever becomes of this process."""
+        """Hand everything to the operating system, so that it survives a crash of this process."""
         self._writer.flush()
         self._settle()
 
     def finish(self) -> None:
-        """Write indexes and summary, and have all of it on the disk."""
+        """Write indexes and summary, and sync the file to the disk."""
         self._writer.finish()
         self._stream.flush()
         os.fsync(self._stream.fileno())
@@ -151,7 +152,7 @@ class McapFile:
     def _settle(self) -> None:
         written = self._stream.tell()
         if written > self._written:
-            # A chunk has gone out.
+            # A chunk has been written.
             self._written, self._pending = written, 0
             self._summary += _PER_CHUNK + _PER_CHUNK_AND_TRACK * len(self._channels)
 
@@ -160,7 +161,7 @@ class McapFile:
         if found is None:
             cdr = track.encoding == "cdr"
             encoding = SchemaEncoding.ROS2 if cdr else SchemaEncoding.JSONSchema
-            text = track.definition.encode() if cdr else b'{"type": "object"}'
+            text = track.definition.encode() if cdr else b'{"type": "object", "properties": {}}'
             found = self._channels[track] = self._writer.register_channel(
                 track.topic,
                 MessageEncoding.CDR if cdr else MessageEncoding.JSON,
@@ -173,7 +174,8 @@ class McapFile:
     def _say_numbers(self, track: McapChannel) -> None:
         if track.offered and not self._numbered:
             self._numbered = True
-            # It stands outside of chunks: the one that is begun must be out before, for the sizes to be right.
+            # Metadata is outside of chunks. The current chunk must be written first, for the sizes to be
+            # right.
             self.flush()
             self._writer.add_metadata(ROSBAG2, {})
             self._settle()
@@ -187,11 +189,11 @@ class McapFile:
 
 
 def repair_file(path: Path, stopping: Callable[[], bool]) -> int | None:
-    """Make a file readable that was not finished: what is whole in it goes into a new one that takes its place.
+    """Make an unfinished file readable: its intact records are copied to a new file, which replaces it.
 
-    :param stopping: asked again and again; when it says so, all is left as it was
-    :returns: how many messages there are, or ``None`` when it was to stop
-    :raises OSError: there is no room, or no such file
+    :param stopping: asked again and again; when true, the file is left as it was
+    :returns: the number of messages, or ``None`` when it was stopped
+    :raises OSError: there is no space, or no such file
     """
     fresh = path.with_suffix(".part")
     try:
@@ -234,12 +236,12 @@ def _copy(damaged: BinaryIO, stream: BinaryIO, chunk_size: int, stopping: Callab
 
 
 def _whole_records(stream: BinaryIO) -> Iterator[McapRecord]:
-    """All up to where the file is damaged or ends."""
+    """The records up to the first damage or the end."""
     records = iter(StreamReader(stream, validate_crcs=True, record_size_limit=RECORD_BYTES).records)
     while True:
         try:
             record = next(records)
         except Exception:
-            # Damage shows itself in as many ways as there are readers and decompressors.
+            # Readers and decompressors report damage by many kinds of exceptions.
             return
         yield record

@@ -1,4 +1,4 @@
-"""Makes readable what broke off: one file after the other, where the disk has room for a copy."""
+"""Repairs recordings that broke off: one file after the other, when the disk has space for a copy."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from relay_server.recordings.writer import NEARLY_FULL
 
 PAUSE_SECONDS = 60.0
 TRIES = 3
-"""What breaks off while the relay runs is mended after a pause, so often; then again whenever all are."""
+"""A recording that breaks off while the relay runs is repaired after a pause, with this many tries."""
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""What has none is tried again after each pause until it has, and that does not count as a try."""
+"""Without space for a copy a file is tried again after each pause, which does not count as a try."""
 
-LOOK_SECONDS = 1.0
-"""How often the disk is looked at while a file is copied."""
+CHECK_SECONDS = 1.0
+"""How often the free space is checked while a file is copied."""
 
 
-class Mended(NamedTuple):
-    """What came of a file.
+class RepairResult(NamedTuple):
+    """The result for one file.
 
-    :param messages: that are in it now
+    :param messages: number of messages in it now
     :param size: bytes
-    :param written: when the last of it had been written, Unix seconds
+    :param written: when its last message was written, Unix seconds
     """
 
     messages: int
@@ -43,12 +43,13 @@ class Mended(NamedTuple):
 
 
 class Repair:
-    """Looks after the recordings of a library that are incomplete.
+    """Repairs the incomplete recordings of a library.
 
-    :param stopping: set when the relay goes down
-    :param busy: whether something else is done with the files of a recording just now
-    :param save: puts on the disk what a recording has become
-    :param drop: takes one off the disk that never had a file
+    :param stopping: set when the relay shuts down
+    :param busy: whether another file operation of a recording runs
+    :param save: saves the description of a recording
+    :param drop: deletes a recording that never had a file
+    :param repaired: called with each recording that can be read again
     """
 
     log = Logger()
@@ -63,6 +64,7 @@ class Repair:
         busy: Callable[[RecordingEntry], bool],
         save: Callable[[RecordingEntry], Awaitable[object]],
         drop: Callable[[RecordingEntry], Awaitable[None]],
+        repaired: Callable[[RecordingEntry], None],
     ) -> None:
         self._clock = clock
         self._library = library
@@ -71,25 +73,26 @@ class Repair:
         self._busy = busy
         self._save = save
         self._drop = drop
+        self._repaired = repaired
         self._one_at_a_time = DeferredLock()
         self._timers: dict[str, Timer] = {}
-        self._lacking: set[str] = set()
-        """Those that wait for room: that is logged once."""
+        self._without_space: set[str] = set()
+        """Recordings that wait for space; that is logged once."""
         self.current: RecordingEntry | None = None
-        """What is being mended, or is about to be."""
+        """The recording that is being repaired, or comes next."""
         self.done: Deferred[None] = succeed(None)
-        """Fires when all has been tried that was asked for last."""
+        """Fires when everything that was requested has been tried."""
 
     def recover(self) -> None:
-        """Begin to mend all that is incomplete; nothing, if that is under way."""
+        """Begin to repair all that is incomplete, unless that is in progress."""
         if self.done.called:
             self.done = Deferred.fromCoroutine(self._recover())
 
     def later(self, entry: RecordingEntry, tries: int = TRIES) -> None:
-        """A recording broke off: mend it after a pause."""
+        """A recording broke off: repair it after a pause."""
         if not self._stopping.is_set():
             cancel(self._timers.get(entry.id))
-            self._timers[entry.id] = self._clock.callLater(PAUSE_SECONDS, self._again, entry, tries)
+            self._timers[entry.id] = self._clock.callLater(PAUSE_SECONDS, self._retry, entry, tries)
 
     def shut(self) -> None:
         """Begin nothing more."""
@@ -97,13 +100,13 @@ class Repair:
             cancel(timer)
         self._timers.clear()
 
-    def _again(self, entry: RecordingEntry, tries: int) -> None:
+    def _retry(self, entry: RecordingEntry, tries: int) -> None:
         del self._timers[entry.id]
-        Deferred.fromCoroutine(self._try(entry, tries - 1))
+        Deferred.fromCoroutine(self._attempt(entry, tries - 1))
 
     async def _recover(self) -> None:
         for entry in self._library.incomplete():
-            await self._try(entry)
+            await self._attempt(entry)
 
     def _open(self, entry: RecordingEntry) -> bool:
         return (
@@ -112,14 +115,14 @@ class Repair:
             and not self._stopping.is_set()
         )
 
-    async def _try(self, entry: RecordingEntry, more: int = 0) -> None:
-        """Mend one, if nothing is in the way.
+    async def _attempt(self, entry: RecordingEntry, more: int = 0) -> None:
+        """Repair one, if nothing else uses it.
 
-        :param more: tries there are after this one
+        :param more: tries left after this one
         """
         async with self._one_at_a_time:
             if not self._open(entry):
-                self._lacking.discard(entry.id)
+                self._without_space.discard(entry.id)
                 return
             if self._busy(entry):
                 return
@@ -136,33 +139,33 @@ class Repair:
                 self.later(entry, more)
 
     async def _has_room(self, entry: RecordingEntry) -> bool:
-        """Mend one, if that can be done; whether there is room for it."""
+        """Repair one if possible; returns whether there was space for it."""
         error: OSError | Unavailable | None = None
         try:
-            await self._mend(entry)
+            await self._repair(entry)
         except (OSError, Unavailable) as found:
             error = found
         except Exception:
-            # Whatever this one has, others may be better.
+            # An error of one file must not stop the others.
             self.log.failure("recording {id} is not recovered", id=entry.id)
         lacking = isinstance(error, OSError) and error.errno in NO_ROOM
-        if error is not None and not (lacking and entry.id in self._lacking):
+        if error is not None and not (lacking and entry.id in self._without_space):
             reason = error.strerror if isinstance(error, OSError) else str(error)
             self.log.error("recording {id} is not recovered: {reason}", id=entry.id, reason=reason)
         if lacking:
-            self._lacking.add(entry.id)
+            self._without_space.add(entry.id)
         else:
-            self._lacking.discard(entry.id)
+            self._without_space.discard(entry.id)
         return not lacking
 
-    async def _mend(self, entry: RecordingEntry) -> None:
-        # The copy takes room beside the file. Asked of the disk, not of what recordings may have in all: else one
-        # that has more than half of that would be lost.
+    async def _repair(self, entry: RecordingEntry) -> None:
+        # The copy takes space beside the file. The disk is asked, not the quota: otherwise a recording that
+        # has more than half of the quota would be lost.
         self._library.copied = entry
         try:
-            mended = await self._threads.run(self._work, entry)
+            mended = await self._threads.run(self._repair_in_thread, entry)
         except FileNotFoundError:
-            # It had just been wanted.
+            # It had just been deleted.
             await self._drop(entry)
             self._library.forget(entry)
             return
@@ -175,39 +178,40 @@ class Repair:
                 "recording {id} was recovered: {count} messages", id=entry.id, count=mended.messages
             )
             await self._save(entry)
+            self._repaired(entry)
 
     # --- in a thread --------------------------------------------------------------------------------------
 
-    def _work(self, entry: RecordingEntry) -> Mended | None:
-        """What became of the file; ``None`` when the relay goes down before.
+    def _repair_in_thread(self, entry: RecordingEntry) -> RepairResult | None:
+        """The result for a file; ``None`` when the relay shuts down meanwhile.
 
-        :raises OSError: it can't be mended; :class:`FileNotFoundError` when there is none
+        :raises OSError: it cannot be repaired; :class:`FileNotFoundError` when there is none
         """
         path = self._library.path(entry)
         found = path.stat()
         if self._library.spare() < found.st_size:
             raise OSError(
-                errno.ENOSPC, f"{NEARLY_FULL}: a copy of {found.st_size / 10**6:.0f} MB has no room"
+                errno.ENOSPC, f"{NEARLY_FULL}: there is no space for a copy of {found.st_size / 10**6:.0f} MB"
             )
-        watch = _Watch(self._library, self._stopping)
+        watch = _StopCheck(self._library, self._stopping)
         messages = repair_file(path, watch)
         if messages is None and watch.nearly_full:
             raise OSError(errno.ENOSPC, NEARLY_FULL)
-        return None if messages is None else Mended(messages, path.stat().st_size, found.st_mtime)
+        return None if messages is None else RepairResult(messages, path.stat().st_size, found.st_mtime)
 
 
-class _Watch:
-    """Says when a copy has to stop: the relay goes down, or others have taken the room."""
+class _StopCheck:
+    """Decides when a copy has to stop: the relay shuts down, or the space is used up."""
 
     def __init__(self, library: Library, stopping: threading.Event) -> None:
         self._library = library
         self._stopping = stopping
-        self._look_at = time.monotonic() + LOOK_SECONDS
+        self._check_at = time.monotonic() + CHECK_SECONDS
         self.nearly_full = False
 
     def __call__(self) -> bool:
         now = time.monotonic()
-        if now >= self._look_at:
-            self._look_at = now + LOOK_SECONDS
+        if now >= self._check_at:
+            self._check_at = now + CHECK_SECONDS
             self.nearly_full = self._library.nearly_full()
         return self.nearly_full or self._stopping.is_set()

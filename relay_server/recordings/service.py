@@ -1,164 +1,208 @@
-"""What the edge asks about recordings: judged by the rights on all that a recording holds."""
+"""Recordings in answers of the HTTP API.
+
+Recordings as users start, list, stop, delete and download them, by their rights on all that a recording
+contains.
+"""
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
-
-import msgspec
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, Literal, TypedDict
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
-from relay_protocol.realms import full_name
 from relay_protocol.rights import Operation
 from relay_server.access import Permit, Principal, may_subscribe
 from relay_server.common.database import AsyncDatabase
 from relay_server.common.token_bucket import TokenBucket
 from relay_server.events.bus import EventBus
-from relay_server.recordings.library import READABLE, RUNNING, UNKNOWN, RecordingEntry, place
+from relay_server.files.storage import ContentReader
+from relay_server.recordings.library import (
+    READABLE,
+    RUNNING,
+    UNKNOWN,
+    RecordingEntry,
+    place,
+    why_denied,
+    why_not,
+)
 from relay_server.recordings.recordings import RecordingRequest, Recordings
-from relay_server.recordings.rights import why_denied, why_not
-from relay_server.sessions.manager import AuthorizedSession, SessionManager
+from relay_server.sessions.download_audit import DownloadAudit
+from relay_server.sessions.manager import Admission, SessionManager
+
+
+class RecordingInfo(TypedDict):
+    """A recording.
+
+    :param begun: Unix seconds
+    :param ended: Unix seconds
+    :param lasted: duration, seconds
+    :param megabytes: largest size of the file
+    """
+
+    id: str
+    robot: str
+    user: str
+    topics: list[str]
+    cameras: list[str]
+    begun: float
+    ended: float | None
+    lasted: float | None
+    state: Literal["recording", "finishing", "complete", "incomplete", "recovered"]
+    reason: str
+    seconds: float
+    megabytes: float
+    bytes: int
+    messages: int
+    drops: int
+    problems: list[str]
+
+
+class RecordingPage(TypedDict):
+    """A page of recordings, the latest first."""
+
+    recordings: list[RecordingInfo]
+    next: str | None
+
+
+class Recordable(TypedDict):
+    """Topics and cameras that the caller could record now.
+
+    :param denied: why there are none
+    :param megabytes: largest size of all recordings of the realm together
+    :param full: why no other recording can begin
+    """
+
+    topics: list[str]
+    cameras: list[str]
+    denied: str
+    megabytes: float
+    left: float
+    full: str
+
 
 RATE = 1.0
 BURST = 20
-"""What one user may have put on record about recordings: so much a second, and so much at once."""
-
-FETCH_SECONDS = 3600.0
-"""A download is put on record once in so long, however many parts the one who has it takes it in."""
-
-FETCHES = 1000
-"""Downloads that are remembered for that."""
+"""Audit entries of one user about recordings: per second, and at once."""
 
 PAGE = 100
 PAGE_MOST = 500
-"""Recordings that are listed at a time, unless others are asked for, and at most."""
+"""Recordings on a page: by default, and at most."""
 
 
 class Download:
-    """A file on its way to somebody. Give it back by :meth:`close`.
+    """A file that is being downloaded. It must be closed.
 
-    :ivar name: for the one who gets it
+    :ivar name: file name for the client
     :ivar size: bytes
-    :ivar tag: names this content; it never changes under it
+    :ivar tag: entity tag; the contents never change
+    :ivar begin: writes the audit entry
     """
 
     def __init__(
         self,
         recordings: Recordings,
         entry: RecordingEntry,
+        content: ContentReader,
         permit: Permit,
         begin: Callable[[], Awaitable[None]],
-        close: Callable[[], None],
+        release: Callable[[], None],
     ) -> None:
         self._recordings = recordings
         self._entry = entry
-        self._permit = permit
-        self._path: Path = recordings.library.path(entry)
+        self.permit = permit
+        self._content = content
+        self._release = release
+        self._closed = False
         self.name = f"{entry.robot}-{entry.id}.mcap"
         self.size = entry.bytes
         self.tag = entry.id
-        self._begin = begin
-        self.close = close
+        self.begin = begin
 
-    async def begin(self) -> None:
-        """Put on record that it is sent.
-
-        :raises Unavailable: it can't be
-        """
-        await self._begin()
-
-    def watch(self, denied: Callable[[str], None]) -> None:
-        """Tell when it may not go on, and why."""
-        self._permit.on_revoke = lambda error: denied(str(error))
-
-        def changed() -> None:
-            reason = why_denied(self._permit, self._entry)
-            if reason:
-                denied(reason)
-
-        self._permit.on_change = changed
-        changed()
+    def allowed(self) -> bool:
+        """Whether it may go on."""
+        return not why_denied(self.permit, self._entry)
 
     async def part(self, offset: int, size: int) -> bytes:
-        """Some of its bytes; none when it is not there any more.
+        """Some bytes of the file; none when it has been deleted.
 
-        :raises OSError: it can't be read
+        :raises OSError: it cannot be read
         """
-        return await self._recordings.read(self._path, offset, size)
+        return await self._recordings.read(self._entry, self._content, offset, size)
+
+    def close(self) -> None:
+        """End the download."""
+        if not self._closed:
+            self._closed = True
+            self._content.close()
+            self._release()
 
 
 class RecordingService:
-    """Recordings as users have them.
-
-    :param wall: Unix time in seconds
-    """
+    """:param wall: Unix time in seconds"""
 
     def __init__(
         self,
-        desk: SessionManager,
+        sessions: SessionManager,
         recordings: Recordings,
         store: AsyncDatabase,
-        journal: EventBus,
+        bus: EventBus,
         wall: Callable[[], float],
     ) -> None:
-        self._desk = desk
+        self._sessions = sessions
         self._recordings = recordings
         self._store = store
-        self._journal = journal
+        self._bus = bus
         self._wall = wall
         self._buckets: dict[int, TokenBucket] = {}
-        self._fetched: OrderedDict[tuple[int, str, str], float] = OrderedDict()
+        self._downloads = DownloadAudit(wall)
 
-    # --- what users ask for -------------------------------------------------------------------------------
+    # --- requests of users ---------------------------------------------------------------------------------
 
     async def start(
         self, principal: Principal, robot: str, ask: RecordingRequest, address: str
-    ) -> dict[str, Any]:
-        """Begin a recording.
+    ) -> RecordingInfo:
+        """Start a recording.
 
         :raises NotFound: no such robot, or no right on it
-        :raises Refused: no right to what is to be recorded
+        :raises Refused: no right to record something
         :raises SwitchboardError: see :meth:`Recordings.start`
         """
-        admission = await self._desk.admit(principal, robot, address)
+        admission = await self._sessions.admit(principal, robot, address)
         try:
             entry = self._recordings.entry(ask, admission.robot, admission.permit)
-            self._see_allowed(admission, entry)
-            await self._on_record("recording.start", entry, admission)
+            self._check_allowed(admission, entry)
+            await self._audit("recording.start", entry, admission)
             await self._recordings.start(
                 entry, admission.robot, admission.permit, lambda entry: self._ended(entry, admission)
             )
         except BaseException:
-            self._desk.turn_away(admission)
+            self._sessions.release(admission)
             raise
-        self._event("recording.started", entry, admission, address=address)
-        return self._view(entry)
+        self._publish("recording.started", entry, admission, address=address)
+        return self._info(entry)
 
     async def may_start(self, principal: Principal, robot: str, ask: RecordingRequest, address: str) -> None:
-        """See that somebody might begin a recording now, without doing it.
+        """Check that a recording could be started now, without doing it.
 
-        :raises SwitchboardError: as :meth:`start`, as far as rights go
+        :raises SwitchboardError: as :meth:`start`, as far as rights are concerned
         """
-        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
-            self._see_allowed(admission, self._recordings.entry(ask, admission.robot, admission.permit))
+        async with self._sessions.admitted(principal, robot, address) as admission:
+            self._check_allowed(admission, self._recordings.entry(ask, admission.robot, admission.permit))
 
     @staticmethod
-    def _see_allowed(admission: AuthorizedSession, entry: RecordingEntry) -> None:
+    def _check_allowed(admission: Admission, entry: RecordingEntry) -> None:
         reason = why_denied(admission.permit, entry)
         if reason:
             raise Refused(reason)
 
-    async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
-        """What the principal could record of a robot now: topics, cameras, and how much.
+    async def possible(self, principal: Principal, robot: str, address: str) -> Recordable:
+        """Topics and cameras of a robot that the principal could record now, and the limits.
 
         :raises NotFound: no such robot, or no right on it
         """
-        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+        async with self._sessions.admitted(principal, robot, address) as admission:
             there, library = admission.robot, self._recordings.library
             topics = {
                 name: self._why_no_topic(admission, name)
@@ -181,16 +225,16 @@ class RecordingService:
 
     async def all(
         self, principal: Principal, robot: str, address: str, limit: int = PAGE, before: str = ""
-    ) -> dict[str, Any]:
-        """The recordings of a robot that the principal may have, the latest first.
+    ) -> RecordingPage:
+        """The recordings of a robot that the principal may read, the latest first.
 
-        :param limit: no more than so many
-        :param before: what an earlier answer gave as ``next``: go on behind the last of that one
+        :param limit: most recordings on the page
+        :param before: ``next`` of an earlier page, which this one follows
         :raises NotFound: no such robot, or no right on it
-        :raises Invalid: no answer gave that
+        :raises Invalid: ``before`` is not of an earlier page
         """
         behind = _place_of(before) if before else None
-        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+        async with self._sessions.admitted(principal, robot, address) as admission:
             found: list[RecordingEntry] = []
             for entry in self._recordings.library.of(admission.robot.robot_id):
                 if (behind is None or place(entry) < behind) and not why_denied(admission.permit, entry):
@@ -200,41 +244,38 @@ class RecordingService:
                     found.append(entry)
             return self._page(found, None)
 
-    def _page(self, found: list[RecordingEntry], following: str | None) -> dict[str, Any]:
-        shown = [self._view(self._recordings.look(entry)) for entry in found]
+    def _page(self, found: list[RecordingEntry], following: str | None) -> RecordingPage:
+        shown = [self._info(self._recordings.updated(entry)) for entry in found]
         return {"recordings": shown, "next": following}
 
-    async def one(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
-        """One recording.
+    async def one(self, principal: Principal, robot: str, id: str, address: str) -> RecordingInfo:
+        """:raises NotFound: no such robot or recording, or no right to all of it"""
+        async with self._sessions.admitted(principal, robot, address) as admission:
+            return self._info(self._recordings.updated(self._find(admission, id)))
 
-        :raises NotFound: no such robot or recording, or no right to all of it
-        """
-        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
-            return self._view(self._recordings.look(self._find(admission, id)))
-
-    async def stop(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
-        """Finish a recording; one that is finished stays what it is.
+    async def stop(self, principal: Principal, robot: str, id: str, address: str) -> RecordingInfo:
+        """Finish a recording; a finished one stays as it is.
 
         :raises NotFound: as :meth:`one`
-        :raises Refused: somebody else's, and no right to manage the robot
+        :raises Refused: another user's recording, without the right to manage the robot
         """
-        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+        async with self._sessions.admitted(principal, robot, address) as admission:
             entry = self._find(admission, id)
             self._check_own(admission.permit, entry)
         await self._recordings.stop(entry, f"stopped by {principal.name}")
-        return self._view(entry)
+        return self._info(entry)
 
     async def delete(self, principal: Principal, robot: str, id: str, address: str) -> None:
-        """Delete a recording; one that runs is stopped before.
+        """Delete a recording; a running one is stopped first.
 
         :raises NotFound: as :meth:`one`
-        :raises Refused: somebody else's, and no right to manage the robot
-        :raises Unavailable: it can't be deleted
+        :raises Refused: another user's recording, without the right to manage the robot
+        :raises Unavailable: it cannot be deleted
         """
-        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+        async with self._sessions.admitted(principal, robot, address) as admission:
             entry = self._find(admission, id)
             self._check_own(admission.permit, entry)
-            await self._on_record("recording.delete", entry, admission)
+            await self._audit("recording.delete", entry, admission)
         await self._recordings.stop(entry, f"deleted by {principal.name}")
         await self._recordings.delete(entry)
 
@@ -242,42 +283,48 @@ class RecordingService:
         """The file of a recording; it must be closed.
 
         :raises NotFound: as :meth:`one`
-        :raises Unavailable: it is not finished
+        :raises Unavailable: it is not finished, or the storage does not answer
         """
-        admission = await self._desk.admit(principal, robot, address)
+        admission = await self._sessions.admit(principal, robot, address)
         try:
             entry = self._find(admission, id)
             if entry.state in RUNNING:
                 raise Unavailable("it is still being recorded: stop it, or wait for its end")
             if entry.state not in READABLE:
                 raise Unavailable("it broke off, and the file is not recovered yet; try again later")
+            content = await self._open(entry)
         except BaseException:
-            self._desk.turn_away(admission)
+            self._sessions.release(admission)
             raise
         return Download(
             self._recordings,
             entry,
+            content,
             admission.permit,
-            lambda: self._fetch(entry, admission),
-            lambda: self._desk.turn_away(admission),
+            lambda: self._downloads.write_once(
+                admission, entry.id, lambda: self._audit("recording.download", entry, admission)
+            ),
+            lambda: self._sessions.release(admission),
         )
+
+    async def _open(self, entry: RecordingEntry) -> ContentReader:
+        """:raises SwitchboardError: its file is missing, or can't be read now"""
+        try:
+            return await self._recordings.open_content(entry)
+        except FileNotFoundError:
+            raise NotFound("the file of this recording is not there any more") from None
+        except OSError:
+            raise Unavailable("the file can't be read now; try again later") from None
 
     # --- rights -------------------------------------------------------------------------------------------
 
     @staticmethod
-    def _why_no_topic(admission: AuthorizedSession, name: str) -> str:
+    def _why_no_topic(admission: Admission, name: str) -> str:
         permit, robot = admission.permit, admission.robot
-        verdict = may_subscribe(permit.judge, robot, name)
-        return why_not(permit, Operation.SUBSCRIBE, name) if verdict.allowed else verdict.reason
+        decision = may_subscribe(permit.decide, robot, name)
+        return why_not(permit, Operation.SUBSCRIBE, name) if decision.allowed else decision.reason
 
-    @contextmanager
-    def _admitted(self, admission: AuthorizedSession) -> Iterator[AuthorizedSession]:
-        try:
-            yield admission
-        finally:
-            self._desk.turn_away(admission)
-
-    def _find(self, admission: AuthorizedSession, id: str) -> RecordingEntry:
+    def _find(self, admission: Admission, id: str) -> RecordingEntry:
         entry = self._recordings.library.find(admission.robot.robot_id, id)
         if why_denied(admission.permit, entry):
             raise NotFound(UNKNOWN)
@@ -287,32 +334,43 @@ class RecordingService:
     def _check_own(permit: Permit, entry: RecordingEntry) -> None:
         if entry.user_id != permit.principal.user_id:
             for name in (*entry.topics, *entry.cameras):
-                verdict = permit.judge(Operation.MANAGE, name)
-                if not verdict.allowed:
-                    raise Refused(f"it is a recording of {entry.user}; {verdict.reason}")
+                decision = permit.decide(Operation.MANAGE, name)
+                if not decision.allowed:
+                    raise Refused(f"this recording belongs to {entry.user}; {decision.reason}")
 
-    def _view(self, entry: RecordingEntry) -> dict[str, Any]:
-        """What its users see of a recording."""
-        shown: dict[str, Any] = msgspec.to_builtins(entry)
-        for hidden in ("robot_id", "user_id", "realm", "home", "pictures"):
-            del shown[hidden]
-        shown["megabytes"] = shown.pop("limit") / 10**6
-        # Told by the relay: the clocks of those who look may be wrong.
+    def _info(self, entry: RecordingEntry) -> RecordingInfo:
+        # Sent by the relay, since the clocks of clients may be wrong.
         until = self._wall() if entry.state in RUNNING else entry.ended
-        shown["lasted"] = None if until is None else round(until - entry.begun, 1)
-        return shown
+        return {
+            "id": entry.id,
+            "robot": entry.robot,
+            "user": entry.user,
+            "topics": list(entry.topics),
+            "cameras": list(entry.cameras),
+            "begun": entry.begun,
+            "ended": entry.ended,
+            "lasted": None if until is None else round(until - entry.begun, 1),
+            "state": entry.state.value,
+            "reason": entry.reason,
+            "seconds": entry.seconds,
+            "megabytes": entry.limit / 10**6,
+            "bytes": entry.bytes,
+            "messages": entry.messages,
+            "drops": entry.drops,
+            "problems": entry.problems,
+        }
 
-    # --- what is put on record ----------------------------------------------------------------------------
+    # --- audit entries and events --------------------------------------------------------------------------
 
-    async def _on_record(self, action: str, entry: RecordingEntry, admission: AuthorizedSession) -> None:
-        """Who does it is on record before it is done.
+    async def _audit(self, action: str, entry: RecordingEntry, admission: Admission) -> None:
+        """Write the audit entry of a request before it is carried out.
 
-        :raises Unavailable: it can't be, or the user does too much
+        :raises Unavailable: it cannot be written, or the user makes too many requests
         """
         principal = admission.permit.principal
         bucket = self._buckets.setdefault(principal.user_id, TokenBucket(RATE, BURST, self._wall))
         if not bucket.take():
-            raise Unavailable("you do too much with recordings at once; try again in a moment")
+            raise Unavailable("you make too many requests about recordings; try again in a moment")
         await self._store.write(
             queries.append_audit,
             at=self._wall(),
@@ -323,19 +381,9 @@ class RecordingService:
             data={"topics": list(entry.topics), "cameras": list(entry.cameras)},
         )
 
-    async def _fetch(self, entry: RecordingEntry, admission: AuthorizedSession) -> None:
-        key = (admission.permit.principal.user_id, entry.id, admission.address)
-        if self._fetched.get(key, -FETCH_SECONDS) + FETCH_SECONDS > self._wall():
-            return
-        await self._on_record("recording.download", entry, admission)
-        self._fetched[key] = self._wall()
-        self._fetched.move_to_end(key)
-        while len(self._fetched) > FETCHES:
-            self._fetched.popitem(last=False)
-
-    def _ended(self, entry: RecordingEntry, admission: AuthorizedSession) -> None:
-        self._desk.turn_away(admission)
-        self._event(
+    def _ended(self, entry: RecordingEntry, admission: Admission) -> None:
+        self._sessions.release(admission)
+        self._publish(
             "recording.ended",
             entry,
             admission,
@@ -346,28 +394,36 @@ class RecordingService:
             drops=entry.drops,
         )
 
-    def _event(self, kind: str, entry: RecordingEntry, admission: AuthorizedSession, **data: Any) -> None:
-        self._journal.event(
-            kind,
-            f"user:{admission.robot.name_of(entry.user, entry.realm)}",
-            cause=f"user:{full_name(entry.user, entry.realm)}",
-            robot_id=entry.robot_id,
-            user_id=entry.user_id,
-            recording=entry.id,
-            **data,
-        )
+    def _publish(self, kind: str, entry: RecordingEntry, admission: Admission, **data: Any) -> None:
+        source = f"user:{admission.robot.name_of(entry.user, entry.realm)}"
+        self._bus.publish(kind, entry.robot_id, source, recording=entry.id, **data)
+
+
+def merge_pages(pages: Sequence[RecordingPage], limit: int) -> RecordingPage:
+    """One page of the pages that several relays have.
+
+    :param limit: most recordings on it
+    """
+    found = [each for page in pages for each in page["recordings"]]
+    found.sort(key=lambda each: (each["begun"], each["id"]), reverse=True)
+    more = len(found) > limit or any(page["next"] is not None for page in pages)
+    shown = found[:limit]
+    return {"recordings": shown, "next": _cursor(shown[-1]["begun"], shown[-1]["id"]) if more else None}
 
 
 def _cursor_of(entry: RecordingEntry) -> str:
-    """Where a page ends: also when that recording is deleted, the next one begins behind it."""
-    begun, id = place(entry)
+    """The end of a page. It stays valid when that recording is deleted."""
+    return _cursor(*place(entry))
+
+
+def _cursor(begun: float, id: str) -> str:
     return f"{begun!r}_{id}"
 
 
 def _place_of(cursor: str) -> tuple[float, str]:
-    """Where :func:`_cursor_of` says.
+    """The position in a cursor of :func:`_cursor_of`.
 
-    :raises Invalid: it never said that
+    :raises Invalid: it is not one
     """
     begun, _, id = cursor.partition("_")
     try:
@@ -375,5 +431,5 @@ def _place_of(cursor: str) -> tuple[float, str]:
     except ValueError:
         at = math.nan
     if not math.isfinite(at):
-        raise Invalid("'before' is what an earlier answer gave as 'next'")
+        raise Invalid("'before' must be 'next' of an earlier page")
     return at, id

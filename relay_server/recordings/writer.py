@@ -1,4 +1,5 @@
-"""Writes a recording in a thread of its own, behind a bounded queue: a slow disk never holds up the relay."""
+"""Writes a recording in a thread of its own, behind a bounded queue, so that a slow disk never delays the
+relay."""
 
 from __future__ import annotations
 
@@ -17,31 +18,32 @@ from relay_server.recordings.mcap_file import McapChannel, McapFile, McapFileFul
 
 QUEUE_BYTES = 32 * MIB
 QUEUE_MESSAGES = 10_000
-"""What may wait for the disk, with what is just being written. What comes then is dropped, and counted."""
+"""Most bytes queued for the disk, including those being written. Further messages are dropped and counted.
+"""
 
 BATCH = 64
-"""Messages that the thread takes at a time; they keep their place in the queue until all of them are written."""
+"""Messages that the thread takes at a time. They count as waiting until all of them are written."""
 
-LOOK_SECONDS = 1.0
-"""How often the disk is looked at."""
+CHECK_SECONDS = 1.0
+"""How often the free space is checked."""
 
 FLUSH_SECONDS = (1.0, 10.0)
-"""How much a relay that is killed may lose: at first, and of a recording that has run for long."""
+"""Most that a killed relay may lose, in seconds: at first, and of a recording that has run for long."""
 
 FLUSH_SHARE = 1 / 60
-"""Of the time a recording has run, what may be lost, between these two. With each flush a chunk ends, which the file's
-index has in memory until the end."""
+"""The share of a recording's duration that may be lost, within these bounds. Each flush ends a chunk, whose
+index stays in memory until the end."""
 
 NEARLY_FULL = "the disk is nearly full"
 
 
 class RecordedMessage(NamedTuple):
-    """Something to be written.
+    """A message to be written.
 
     :param log_time: nanoseconds
     :param publish_time: nanoseconds
     :param body: as it came
-    :param make: what is to be written of it; called in the writer's thread, raises :class:`SwitchboardError`
+    :param make: converts the body; runs in the writer's thread, may raise :class:`SwitchboardError`
     """
 
     track: McapChannel
@@ -52,23 +54,23 @@ class RecordedMessage(NamedTuple):
 
 
 def flush_pause(age: float) -> float:
-    """Seconds until the next flush of a recording that has run for so many."""
+    """Seconds until the next flush of a recording that has run this many seconds."""
     least, most = FLUSH_SECONDS
     return min(most, max(least, age * FLUSH_SHARE))
 
 
-class CallsBack(Protocol):
-    """The reactor, as a thread uses it."""
+class ReactorThread(Protocol):
+    """The reactor, as threads use it."""
 
     def callFromThread(self, call: Callable[..., object], *args: object) -> None:
-        """Call this in the reactor's thread."""
+        """Call a function in the reactor's thread."""
 
 
 class WriteOutcome(NamedTuple):
-    """How the writing ended.
+    """How writing ended.
 
-    :param finished: whether the file is whole
-    :param reason: why it ended, where nobody asked for it
+    :param finished: whether the file is complete
+    :param reason: why it ended, unless that was requested
     """
 
     finished: bool
@@ -76,20 +78,21 @@ class WriteOutcome(NamedTuple):
 
 
 class RecordingWriter:
-    """The file of one recording, from its beginning to its end. All but the thread's own is the reactor's.
+    """The file of one recording, from its beginning to its end. Methods belong to the reactor's thread,
+    except for the marked ones.
 
-    :param path: where nothing is yet
-    :param limit: bytes the file may have
-    :param ros: whether messages are those of ROS 2
-    :param nearly_full: whether the disk is; asked in the thread, may raise :class:`OSError`
-    :param ended: called once in the reactor's thread
+    :param path: of a file that does not exist yet
+    :param limit: bytes of the file
+    :param ros: whether messages are ROS 2 messages
+    :param nearly_full: whether the disk is; called in the thread, may raise :class:`OSError`
+    :param ended: called once, in the reactor's thread
     """
 
     log = Logger()
 
     def __init__(
         self,
-        reactor: CallsBack,
+        reactor: ReactorThread,
         path: Path,
         limit: int,
         ros: bool,
@@ -104,26 +107,26 @@ class RecordingWriter:
         self._ended = ended
         self._waiting: deque[RecordedMessage] = deque()
         self._waiting_bytes = 0
-        self._in_hand = 0
+        self._in_batch = 0
         self._closing = False
         self._astonished = False
         self._changed = threading.Condition()
         self.bytes = 0
         self.messages = 0
         self.broken = 0
-        """Messages that could not be made into what is written."""
+        """Messages that could not be converted."""
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
 
     def start(self) -> None:
-        """Begin the file."""
+        """Create the file and start the thread."""
         self._thread.start()
 
     def put(self, message: RecordedMessage) -> bool:
-        """Have a message written; whether there is room for it."""
+        """Queue a message; false if there is no room for it."""
         with self._changed:
             if (
                 self._closing
-                or len(self._waiting) + self._in_hand >= QUEUE_MESSAGES
+                or len(self._waiting) + self._in_batch >= QUEUE_MESSAGES
                 or (self._waiting_bytes and self._waiting_bytes + len(message.body) > QUEUE_BYTES)
             ):
                 return False
@@ -133,7 +136,7 @@ class RecordingWriter:
         return True
 
     def finish(self) -> None:
-        """Nothing more comes: write what waits and finish the file."""
+        """Write the queue, and finish the file."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -144,10 +147,10 @@ class RecordingWriter:
         try:
             outcome = self._write()
         except OSError as error:
-            outcome = WriteOutcome(False, f"the file can't be written: {error.strerror}")
+            outcome = WriteOutcome(False, f"the file cannot be written: {error.strerror}")
         except Exception:
             self.log.failure("writing a recording failed")
-            outcome = WriteOutcome(False, "the relay failed on it; its log tells more")
+            outcome = WriteOutcome(False, "the relay failed on it; see its log")
         self.finish()
         self._reactor.callFromThread(self._ended, outcome)
 
@@ -156,44 +159,44 @@ class RecordingWriter:
         with self._path.open("xb") as stream:
             file = McapFile(stream, self._limit, self._ros)
             began = time.monotonic()
-            look_at, flush_at = began + LOOK_SECONDS, began + flush_pause(0)
+            check_at, flush_at = began + CHECK_SECONDS, began + flush_pause(0)
             while True:
-                batch, closing = self._take(min(look_at, flush_at) - time.monotonic())
+                batch, closing = self._take(min(check_at, flush_at) - time.monotonic())
                 try:
                     for message in batch:
                         self._add(file, message)
                 except McapFileFull:
-                    reason = "it has reached its size"
+                    reason = "it has reached its size limit"
                     break
-                self._put_down(batch)
+                self._mark_written(batch)
                 if closing and not batch:
                     break
                 now = time.monotonic()
                 if now >= flush_at:
                     file.flush()
                     flush_at = now + flush_pause(now - began)
-                if now >= look_at:
+                if now >= check_at:
                     if self._nearly_full():
                         reason = NEARLY_FULL
                         break
-                    look_at = now + LOOK_SECONDS
+                    check_at = now + CHECK_SECONDS
                 self.bytes, self.messages = file.size, file.messages
             file.finish()
             self.bytes, self.messages = file.size, file.messages
         return WriteOutcome(True, reason)
 
     def _take(self, seconds: float) -> tuple[list[RecordedMessage], bool]:
-        """Some of what waits, after at most so long; and whether no more may come."""
+        """Messages from the queue, after a wait of at most ``seconds``; and whether no more may come."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._closing, max(0.0, seconds))
             batch = [self._waiting.popleft() for _ in range(min(BATCH, len(self._waiting)))]
-            self._in_hand = len(batch)
+            self._in_batch = len(batch)
             return batch, self._closing
 
-    def _put_down(self, batch: list[RecordedMessage]) -> None:
-        """These are written: others may have their place."""
+    def _mark_written(self, batch: list[RecordedMessage]) -> None:
+        """These are written and no longer count as waiting."""
         with self._changed:
-            self._in_hand = 0
+            self._in_batch = 0
             self._waiting_bytes -= sum(len(message.body) for message in batch)
 
     def _add(self, file: McapFile, message: RecordedMessage) -> None:
@@ -205,10 +208,10 @@ class RecordingWriter:
                 self.broken += 1
                 return
             except Exception:
-                # What came from a robot must never end the file for all the others.
+                # Data from a robot must never end the file for all other data.
                 if not self._astonished:
                     self._astonished = True
-                    self.log.failure("a message of {topic} could not be made", topic=message.track.topic)
+                    self.log.failure("a message of {topic} could not be converted", topic=message.track.topic)
                 self.broken += 1
                 return
         file.add(message.track, message.log_time, message.publish_time, body)

@@ -1,7 +1,7 @@
-"""What the relay itself offers in every robot's graph: names and types, as every node's are known there.
+"""The relay's own services and topics in every robot's graph, with the definitions of their types.
 
 The types of ``/rosapi/…`` have the fields of ``rosapi_msgs`` (rosbridge_suite, for ROS 2), those of ``/relay/…`` are in
-SPEC section 1.7. So a client can ask for their definitions like for any other.
+SPEC 1.7. Clients can ask for these definitions as for any other.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 from relay_protocol.link import Service, Topic
 from relay_protocol.ros_types import TypeRegistry
-from relay_server.relay_node import control_types
 
 PACKAGES = ("rosapi_msgs/", "switchboard_msgs/")
 """How the names of these types begin."""
@@ -28,11 +27,12 @@ _TIME = "builtin_interfaces/msg/Time"
 _DETAILS = f"string type\n---\nTypeDef[] typedefs\n{_LINE}\nMSG: {_TYPEDEF}\n{_TYPEDEF_TEXT}"
 
 
-class RelayInterfaces(NamedTuple):
-    """One service of the relay's own.
+class RelayService(NamedTuple):
+    """A service of the relay's own.
 
-    :param node: who provides it
-    :param text: its type's definition
+    :param node: the node that provides it
+    :param type: its full name
+    :param text: the definition of the type
     """
 
     node: str
@@ -40,15 +40,82 @@ class RelayInterfaces(NamedTuple):
     text: str
 
 
-def _rosapi(type_name: str, text: str) -> RelayInterfaces:
-    return RelayInterfaces(ROSAPI, f"rosapi_msgs/srv/{type_name}", text)
+def _rosapi(type_name: str, text: str) -> RelayService:
+    return RelayService(ROSAPI, f"rosapi_msgs/srv/{type_name}", text)
 
+
+def _relay(type_name: str, text: str) -> RelayService:
+    return RelayService(RELAY, f"switchboard_msgs/srv/{type_name}", text)
+
+
+_RESULT = "---\nbool success\nstring message\n"
+_ORDER = _relay("Order", f"string why\n{_RESULT}")
+_MODULE_ORDER = _relay("OrderModule", f"string module\n{_RESULT}")
+_PIPE_ORDER = _relay("OrderPipe", f"string pipe\n{_RESULT}string state\n")
+_PIPE = (
+    "string name\nstring owner\nstring source_robot\nstring source_topic\nstring source_service\nstring source_action\n"
+    "string source_program\nstring source_port\nstring source_function\n"
+    "string target_robot\nstring target_topic\nstring target_service\nstring target_action\n"
+    "string target_program\nstring target_port\nstring target_function\n"
+    "float64 rate\nstring state\nstring why\nbool moves\nuint64 messages\nuint64 drops\nuint64 encoded\n"
+    "float64 latency_ms\n"
+)
+_ROLE_ORDER = _relay("OrderRole", f"string role\n{_RESULT}string state\n")
+_ELEMENT = "string role\nstring element\n"
+_ELEMENT_ORDER = _relay("OrderElement", f"{_ELEMENT}{_RESULT}string state\n")
+_FUNCTION = "string name\nuint32 version\nstring text\nstring arguments\nstring result\n"
+_JOB = f"{_RESULT}string job\nstring state\nstring result\nstring code\n"
+_LOG_LINE = "float64 at\nstring stream\nstring level\nstring text\n"
+_REPLY = _relay("Reply", f"string why\nuint32 client\n{_RESULT}")
+_STOPPED = (
+    f"{_LINE}\nMSG: switchboard_msgs/msg/Stopped\nstring by\nstring why\nfloat64 since\nbool confirmed\n"
+    f"FurtherStop again\n{_LINE}\nMSG: switchboard_msgs/msg/FurtherStop\nstring by\nstring why\nfloat64 since\n"
+)
 
 SERVICES = {
-    **{name: RelayInterfaces(RELAY, *type) for name, type in control_types.SERVICES.items()},
-    "/relay/ping": RelayInterfaces(
-        RELAY, "switchboard_msgs/srv/Ping", "bool robot\n---\nint64 relay_time_ns\nfloat64 robot_rtt_ms\n"
+    "/relay/take_control": _ORDER,
+    "/relay/release_control": _ORDER,
+    "/relay/grant_control": _REPLY,
+    "/relay/refuse_control": _REPLY,
+    "/relay/stop": _relay(
+        "Stop", f"string why\nstring stop_id\n{_RESULT}bool done\nStopped stopped\n{_STOPPED}"
     ),
+    "/relay/resume": _ORDER,
+    "/relay/suppress": _relay("Suppress", f"string resource\nuint32 ms 100\n{_RESULT}"),
+    "/relay/inhibit": _relay("Inhibit", f"string resource\nuint32 ms 1000\nbool hold\n{_RESULT}"),
+    "/relay/start_module": _MODULE_ORDER,
+    "/relay/stop_module": _MODULE_ORDER,
+    "/relay/restart_module": _MODULE_ORDER,
+    "/relay/module_log": _relay(
+        "ModuleLog",
+        "string module\nuint64 after\nuint32 limit 100\nuint64 before\nstring level\n---\n"
+        "LogLine[] lines\nuint64 previous\nuint64 next\nbool missed\n"
+        f"{_LINE}\nMSG: switchboard_msgs/msg/LogLine\n{_LOG_LINE}",
+    ),
+    "/relay/pipes": _relay("Pipes", f"---\nPipe[] pipes\n{_LINE}\nMSG: switchboard_msgs/msg/Pipe\n{_PIPE}"),
+    "/relay/add_pipe": _PIPE_ORDER,
+    "/relay/start_pipe": _PIPE_ORDER,
+    "/relay/stop_pipe": _PIPE_ORDER,
+    "/relay/remove_pipe": _PIPE_ORDER,
+    "/relay/functions": _relay(
+        "Functions", f"---\nFunction[] functions\n{_LINE}\nMSG: switchboard_msgs/msg/Function\n{_FUNCTION}"
+    ),
+    "/relay/call_function": _relay(
+        "CallFunction", f"string function\nstring arguments\nuint32 version\nfloat64 timeout\n{_JOB}"
+    ),
+    "/relay/function_job": _relay(
+        "FunctionJob", f"string job\nfloat64 wait\nbool cancel\n{_JOB}float64 progress\n"
+    ),
+    "/relay/get_element": _relay("GetElement", f"{_ELEMENT}{_RESULT}string value\n"),
+    "/relay/set_element": _relay("SetElement", f"{_ELEMENT}string value\nstring type\n{_RESULT}"),
+    "/relay/call_element": _relay(
+        "CallElement", f"{_ELEMENT}string args\nfloat64 timeout 10\n{_RESULT}string values\n"
+    ),
+    "/relay/start_element": _ELEMENT_ORDER,
+    "/relay/stop_element": _ELEMENT_ORDER,
+    "/relay/start_role": _ROLE_ORDER,
+    "/relay/stop_role": _ROLE_ORDER,
+    "/relay/ping": _relay("Ping", "bool robot\n---\nint64 relay_time_ns\nfloat64 robot_rtt_ms\n"),
     "/rosapi/action_feedback_details": _rosapi("ActionFeedbackDetails", _DETAILS),
     "/rosapi/action_goal_details": _rosapi("ActionGoalDetails", _DETAILS),
     "/rosapi/action_result_details": _rosapi("ActionResultDetails", _DETAILS),
@@ -100,6 +167,7 @@ uint32 more
 uint64 drops
 TopicDrops[] topic_drops
 Lost[] lost
+TopicDrops[] publish_drops
 Downlink downlink
 uint64 plain_instead
 uint64 refusals
@@ -204,6 +272,7 @@ uint8 quality
 float64 fps
 float64 reduced
 float64 delay_ms
+uint64 damaged
 {_LINE}
 MSG: switchboard_msgs/msg/Motion
 string[] types
@@ -227,7 +296,125 @@ uint64 watchdog_stops
 uint64 dropped_samples
 """
 
-TOPICS = {"/relay/control": control_types.CONTROL, "/relay/status": STATUS}
+CONTROL = "switchboard_msgs/msg/Control"
+
+_CONTROL_TEXT = f"""string robot
+string state
+Holder holder
+Request request
+Stopped stopped
+bool moving
+Suppressed[] suppressed
+Inhibited[] inhibited
+LevelLimits limits
+You you
+{_LINE}
+MSG: switchboard_msgs/msg/Holder
+string user
+uint32 client
+float64 since
+bool you
+bool implicit
+{_LINE}
+MSG: switchboard_msgs/msg/Request
+string user
+uint32 client
+float64 since
+string why
+bool you
+float64 until
+{_STOPPED}{_LINE}
+MSG: switchboard_msgs/msg/Suppressed
+string resource
+uint32[] sources
+string by
+uint32 ms
+{_LINE}
+MSG: switchboard_msgs/msg/Inhibited
+string resource
+bool hold
+string by
+uint32 ms
+{_LINE}
+MSG: switchboard_msgs/msg/LevelLimits
+Limits operator
+Limits owner
+{_LINE}
+MSG: switchboard_msgs/msg/Limits
+float64 linear
+float64 angular
+float64 linear_acceleration
+float64 angular_acceleration
+{_LINE}
+MSG: switchboard_msgs/msg/You
+uint32 client
+bool may_control
+bool may_resume
+"""
+
+MODULES = "switchboard_msgs/msg/Modules"
+_MODULES_TEXT = f"""string robot
+bool online
+bool current
+float64 reported_at
+Module[] modules
+{_LINE}
+MSG: switchboard_msgs/msg/Module
+string name
+string kind
+string state
+bool wanted
+float64 since
+uint32 pid
+uint32 restarts
+string last_exit
+string[] after
+string why
+PendingOrder pending
+RefusedOrder refused
+{_LINE}
+MSG: switchboard_msgs/msg/PendingOrder
+string action
+string by
+float64 at
+{_LINE}
+MSG: switchboard_msgs/msg/RefusedOrder
+string action
+string by
+float64 at
+string why
+"""
+
+PROCESSES = "switchboard_msgs/msg/Processes"
+_PROCESSES_TEXT = f"""float64 at
+Process[] processes
+uint32 more
+string error
+{_LINE}
+MSG: switchboard_msgs/msg/Process
+uint32 pid
+uint32 parent
+string name
+string part
+string state
+float64 busy
+float64 read_at
+float64 cpu
+uint32 cpu_number
+int8 nice
+uint32 threads
+uint64 voluntary
+uint64 involuntary
+float64 created
+uint64 memory
+"""
+
+TOPICS = {
+    "/relay/control": CONTROL,
+    "/relay/modules": MODULES,
+    "/relay/processes": PROCESSES,
+    "/relay/status": STATUS,
+}
 
 OWN_SERVICES = {
     name: Service(types=[offered.type], providers=[offered.node]) for name, offered in SERVICES.items()
@@ -238,7 +425,9 @@ OWN_TOPICS = {name: Topic(types=[type_name], publishers=[RELAY]) for name, type_
 def _registry() -> TypeRegistry:
     types = TypeRegistry()
     types.add(STATUS, _STATUS_TEXT)
-    types.add(control_types.CONTROL, control_types.CONTROL_TEXT)
+    types.add(CONTROL, _CONTROL_TEXT)
+    types.add(MODULES, _MODULES_TEXT)
+    types.add(PROCESSES, _PROCESSES_TEXT)
     types.add(_TYPEDEF, _TYPEDEF_TEXT)
     for offered in SERVICES.values():
         types.add(offered.type, offered.text)
@@ -248,6 +437,4 @@ def _registry() -> TypeRegistry:
 TYPES = _registry()
 """The definitions of all of these."""
 
-TYPE_NAMES = sorted(
-    {STATUS, _TYPEDEF, control_types.CONTROL, *(offered.type for offered in SERVICES.values())}
-)
+TYPE_NAMES = sorted({_TYPEDEF, *TOPICS.values(), *(offered.type for offered in SERVICES.values())})

@@ -1,7 +1,7 @@
 """``/rosapi/…`` about parameters, answered by the nodes' own parameter services on the robot.
 
-A parameter is named ``<node>:<parameter>``, its value is JSON text. Whoever asks needs the right to call just that
-service of just that node. Source: rosapi of rosbridge_suite for ROS 2; ROS 2 design, "ROS 2 Parameters";
+A parameter is named ``<node>:<parameter>``, its value is JSON text. The caller needs the right to call that service of
+that node. Source: rosapi of rosbridge_suite for ROS 2; ROS 2 design, "ROS 2 Parameters";
 ``rcl_interfaces/msg/ParameterType``.
 """
 
@@ -18,10 +18,11 @@ from relay_protocol import jsontext, nonfinite
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, SwitchboardError, Unavailable
 from relay_protocol.limits import NAME
 from relay_protocol.rights import Operation
-from relay_server.common.gather import PerKeySemaphore, gather_per_key
+from relay_server.common.concurrency import PerKeySemaphore, gather_per_key
 from relay_server.relay_node.arguments import absolute, text
-from relay_server.relay_node.view import view
-from relay_server.sessions.session import Session
+from relay_server.relay_node.visible_graph import visible_graph
+from relay_server.sessions.context import ClientContext
+from relay_server.sessions.motion_requests import call_context
 
 NOT_SET = 0
 BOOL = 1
@@ -48,17 +49,17 @@ _FIELDS = {
 _OF_ELEMENTS = {BOOL: BOOLS, INTEGER: INTEGERS, DOUBLE: DOUBLES, STRING: STRINGS}
 
 
-def from_parameter(told: Any) -> tuple[Any] | None:
+def from_parameter(parameter: Any) -> tuple[Any] | None:
     """The value as JSON has it, in a tuple of its own because it can be null (NaN); ``None`` when nothing is set.
 
-    :param told: a ParameterValue in JSON, from a robot
+    :param parameter: a ParameterValue in JSON, from a robot
     :raises Invalid: it is none
     """
     try:
-        kind = told["type"]
+        kind = parameter["type"]
         if kind == NOT_SET:
             return None
-        value = told[_FIELDS[kind]]
+        value = parameter[_FIELDS[kind]]
         if kind == BYTES and isinstance(value, str):
             # In messages bytes are base64; a parameter's value is what people read and write.
             return (list(base64.b64decode(value, validate=True)),)
@@ -67,23 +68,23 @@ def from_parameter(told: Any) -> tuple[Any] | None:
     return (value,)
 
 
-def to_parameter(value: Any, has: int | None = None) -> dict[str, Any]:
+def to_parameter(value: Any, current_type: int | None = None) -> dict[str, Any]:
     """A ParameterValue in JSON, to be sent to a robot.
 
     :param value: decoded from JSON
-    :param has: the type the parameter has now, where that is known: it decides between 1 and 1.0, bytes and
-        integers, what an empty list is of, and whether null is NaN, as which it is read
+    :param current_type: the type the parameter has now, where that is known: it decides between 1 and 1.0, bytes
+        and integers, what an empty list is of, and whether null is NaN, as which it is read
     :raises Invalid: no parameter can have this value
     """
     if isinstance(value, list):
-        if has == DOUBLES or any(isinstance(each, float) for each in value):
+        if current_type == DOUBLES or any(isinstance(each, float) for each in value):
             value = [math.nan if each is None else each for each in value]
-        kind = _kind_of_list(value, has)
+        kind = _kind_of_list(value, current_type)
     else:
-        if value is None and has == DOUBLE:
+        if value is None and current_type == DOUBLE:
             value = math.nan
         kind = _kind(value)
-        if kind == INTEGER and has == DOUBLE:
+        if kind == INTEGER and current_type == DOUBLE:
             kind = DOUBLE
     return {"type": kind, _FIELDS[kind]: value}
 
@@ -104,15 +105,15 @@ def _kind(value: Any) -> int:
     raise Invalid("a parameter is a boolean, a number, a string, or a list of one of these")
 
 
-def _kind_of_list(values: list[Any], has: int | None) -> int:
+def _kind_of_list(values: list[Any], current_type: int | None) -> int:
     kinds = {_kind(each) for each in values}
     if not kinds:
-        if has in (BYTES, BOOLS, INTEGERS, DOUBLES, STRINGS):
-            return has
-        raise Invalid("nobody can tell what an empty list would hold: the parameter has no type yet")
-    if kinds == {INTEGER, DOUBLE} or (kinds == {INTEGER} and has == DOUBLES):
+        if current_type in (BYTES, BOOLS, INTEGERS, DOUBLES, STRINGS):
+            return current_type
+        raise Invalid("the parameter has no type yet, and an empty list has none; send a list with a value")
+    if kinds == {INTEGER, DOUBLE} or (kinds == {INTEGER} and current_type == DOUBLES):
         return DOUBLES
-    if kinds == {INTEGER} and has == BYTES and all(0 <= each <= 255 for each in values):
+    if kinds == {INTEGER} and current_type == BYTES and all(0 <= each <= 255 for each in values):
         return BYTES
     if len(kinds) > 1:
         raise Invalid("a parameter's list holds values of one type only")
@@ -157,64 +158,65 @@ def _split(args: Any) -> tuple[str, str]:
     return absolute(node), parameter
 
 
-async def _ask(
-    session: Session,
+async def ask_node(
+    client: ClientContext,
     node: str,
     service: str,
     request: Any,
     seconds: float = SECONDS,
-    stamp: int | None = None,
+    earliest_sent: int | None = None,
 ) -> Any:
     """Call a parameter service of a node.
 
-    :param stamp: the relay's monotonic nanoseconds before which this can't have been asked for; as of now when it is
-        left out
+    :param earliest_sent: see :class:`relay_server.sessions.message_age.MessageAge`;
+        ``None``: that of what the client sends now
     :raises Refused: the caller may not call it
     :raises NotFound: the node is not there, or has no such service
     """
     name = f"{node}/{service}"
-    with session.share.counted():
-        session.judge(Operation.CALL, name)
-        found = view(session).services.get(name)
+    with client.quota.counted():
+        client.require(Operation.CALL, name)
+        found = visible_graph(client).services.get(name)
         if found is None or not found.types:
-            raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
-    session.share.asks_robot()
-    answer = await session.channel.asking.call(
+            raise NotFound(f"there is no node {node} with parameters on robot {client.robot.name}")
+    client.quota.count_robot_request()
+    answer = await client.channel.requests.call(
         name,
         found.types[0],
-        jsontext.encode(nonfinite.with_marks(request)),
+        jsontext.encode(nonfinite.from_floats(request)),
         seconds,
-        session.calling.sent(name, session.not_before if stamp is None else stamp),
+        call_context(client, name, client.earliest_sent if earliest_sent is None else earliest_sent),
     )
-    with session.share.counted():
+    with client.quota.counted():
         return jsontext.decode_any(answer)
 
 
-async def _value(session: Session, node: str, parameter: str) -> Any:
+async def _value(client: ClientContext, node: str, parameter: str) -> Any:
     """The parameter's ``rcl_interfaces/msg/ParameterValue``; its type is 0 when it is not set."""
-    answer = await _ask(session, node, "get_parameters", {"names": [parameter]})
+    answer = await ask_node(client, node, "get_parameters", {"names": [parameter]})
     try:
         values = answer["values"]
         # A node that does not know the parameter at all sends no value.
         return values[0] if values else {"type": NOT_SET}
     except (TypeError, KeyError) as error:
-        raise _odd(node) from error
+        raise odd_answer(node) from error
 
 
-def _odd(node: str) -> Unavailable:
+def odd_answer(node: str) -> Unavailable:
+    """The error of an answer that can't be read."""
     return Unavailable(f"node {node} gave an answer about its parameters that makes no sense")
 
 
-async def get_param(session: Session, args: Any) -> Any:
+async def get_param(client: ClientContext, args: Any) -> Any:
     """``/rosapi/get_param``. What can't be had comes as ``default_value``, or as null."""
     default = text(args, "default_value", 1, "")
     try:
         node, parameter = _split(args)
-        found = await _value(session, node, parameter)
+        found = await _value(client, node, parameter)
         try:
             value = from_parameter(found)
         except Invalid as error:
-            raise _odd(node) from error
+            raise odd_answer(node) from error
         if value is not None:
             return _got(jsontext.encode(value[0]).decode())
         if default:
@@ -239,74 +241,74 @@ def _as_json(default: str) -> str:
         return jsontext.encode(default).decode()
 
 
-async def has_param(session: Session, args: Any) -> Any:
+async def has_param(client: ClientContext, args: Any) -> Any:
     """``/rosapi/has_param``: false also for what the caller may not ask, as for what is not there."""
     try:
         node, parameter = _split(args)
-        return {"exists": from_parameter(await _value(session, node, parameter)) is not None}
+        return {"exists": from_parameter(await _value(client, node, parameter)) is not None}
     except SwitchboardError:
         return {"exists": False}
 
 
-async def set_param(session: Session, args: Any) -> Any:
+async def set_param(client: ClientContext, args: Any) -> Any:
     """``/rosapi/set_param``"""
-    given, stamp = text(args, "value", 1), session.not_before
+    given, earliest_sent = text(args, "value", 1), client.earliest_sent
     try:
         node, parameter = _split(args)
         try:
-            value = nonfinite.plain(jsontext.decode_any(nonfinite.mark(given.encode())))
+            value = nonfinite.to_floats(jsontext.decode_any(nonfinite.mark(given.encode())))
         except MalformedMessage as error:
             raise Invalid(f"'value' must be JSON text: {error}") from None
-        session.judge(Operation.CALL, f"{node}/set_parameters")
-        has = await _type_it_has(session, node, parameter) if _ambiguous(value) else None
-        return await _set(session, node, parameter, to_parameter(value, has), stamp)
+        client.require(Operation.CALL, f"{node}/set_parameters")
+        current_type = await type_of_parameter(client, node, parameter) if is_ambiguous(value) else None
+        return await _set(client, node, parameter, to_parameter(value, current_type), earliest_sent)
     except SwitchboardError as error:
         return {"successful": False, "reason": str(error)}
 
 
-def _ambiguous(value: Any) -> bool:
-    """JSON does not tell 1 from 1.0, NaN from nothing, nor bytes from integers, nor what an empty list would hold."""
+def is_ambiguous(value: Any) -> bool:
+    """JSON does not distinguish 1 from 1.0, NaN from null, bytes from integers, nor types of empty lists."""
     return isinstance(value, list | None) or (isinstance(value, int) and not isinstance(value, bool))
 
 
-async def _type_it_has(session: Session, node: str, parameter: str) -> int | None:
-    """The type of the parameter now, ``None`` when nobody can tell."""
+async def type_of_parameter(client: ClientContext, node: str, parameter: str) -> int | None:
+    """The type of the parameter now, ``None`` when it is not known."""
     try:
-        found = (await _value(session, node, parameter))["type"]
+        found = (await _value(client, node, parameter))["type"]
     except (SwitchboardError, TypeError, KeyError):
         return None
     return found if isinstance(found, int) else None
 
 
-async def delete_param(session: Session, args: Any) -> Any:
+async def delete_param(client: ClientContext, args: Any) -> Any:
     """``/rosapi/delete_param``: in ROS 2 a parameter is deleted by setting it to nothing."""
     try:
         node, parameter = _split(args)
-        return await _set(session, node, parameter, {"type": NOT_SET})
+        return await _set(client, node, parameter, {"type": NOT_SET})
     except SwitchboardError as error:
         return {"successful": False, "reason": str(error)}
 
 
 async def _set(
-    session: Session, node: str, parameter: str, value: dict[str, Any], stamp: int | None = None
+    client: ClientContext, node: str, parameter: str, value: dict[str, Any], earliest_sent: int | None = None
 ) -> dict[str, Any]:
     request = {"parameters": [{"name": parameter, "value": value}]}
-    answer = await _ask(session, node, "set_parameters", request, stamp=stamp)
+    answer = await ask_node(client, node, "set_parameters", request, earliest_sent=earliest_sent)
     try:
         (result,) = answer["results"]
         done, reason = bool(result["successful"]), str(result["reason"])
     except (TypeError, KeyError, ValueError) as error:
-        raise _odd(node) from error
+        raise odd_answer(node) from error
     if done:
-        session.notice("param.set", param=f"{node}:{parameter}", deleted=value["type"] == NOT_SET)
+        client.activity("param.set", param=f"{node}:{parameter}", deleted=value["type"] == NOT_SET)
     return {"successful": done, "reason": reason}
 
 
-async def get_param_names(session: Session, args: Any) -> Any:
-    """``/rosapi/get_param_names``: of all nodes the caller may ask, side by side. Who does not answer is left out."""
+async def get_param_names(client: ClientContext, args: Any) -> Any:
+    """``/rosapi/get_param_names``: of all nodes the caller may ask, at the same time. Silent nodes are left out."""
     nodes = [
         name.removesuffix("/list_parameters")
-        for name, service in view(session).services.items()
+        for name, service in visible_graph(client).services.items()
         if name.endswith("/list_parameters") and _LIST in service.types
     ]
     found: dict[str, list[str]] = {}
@@ -314,16 +316,16 @@ async def get_param_names(session: Session, args: Any) -> Any:
 
     async def ask(node: str) -> None:
         nonlocal room
-        # Who does not answer, or not with names, is left out.
+        # Nodes that do not answer, or not with names, are left out.
         with contextlib.suppress(SwitchboardError, TypeError, KeyError):
-            answer = await _ask(session, node, "list_parameters", {}, LIST_SECONDS)
-            told = answer["result"]["names"][:NAMES]
-            found[node] = [f"{node}:{each}" for each in told if isinstance(each, str) and len(each) <= NAME]
+            answer = await ask_node(client, node, "list_parameters", {}, LIST_SECONDS)
+            names = answer["result"]["names"][:NAMES]
+            found[node] = [f"{node}:{each}" for each in names if isinstance(each, str) and len(each) <= NAME]
             room -= len(found[node])
         if room <= 0:
             waiting.clear()
 
-    mine, places = _surveys_of_user.take(session.allowance), _surveys.take(session.channel)
+    mine, places = _surveys_of_user.take(client.quota.user), _surveys.take(client.channel)
     with mine, places, contextlib.suppress(Unavailable):
-        await session.channel.asking.within(ALL_SECONDS, gather_per_key(waiting, ask))
+        await client.channel.requests.within(ALL_SECONDS, gather_per_key(waiting, ask))
     return {"names": [name for node in nodes for name in found.get(node, [])][:NAMES]}

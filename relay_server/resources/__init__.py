@@ -1,1 +1,1 @@
-"""A robot's topics, services, actions, parameters, cameras and nodes as HTTP resources (SPEC section 1.13)."""
+"""A robot's topics, services, actions, parameters, cameras and nodes as HTTP resources (SPEC 1.13)."""

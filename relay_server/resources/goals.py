@@ -1,4 +1,4 @@
-"""Goals over HTTP: given, told of, cancelled, and remembered for some minutes when they are over."""
+"""Goals over HTTP: sent, polled, cancelled, and stored for some minutes after their end."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import msgspec
 from twisted.internet.defer import Deferred
@@ -18,28 +18,28 @@ from relay_protocol.limits import KIB, MIB
 from relay_protocol.rights import Operation
 from relay_server.access import Principal
 from relay_server.channels.goals import GoalStatusCode
-from relay_server.channels.robot_link import resolve
+from relay_server.channels.names import normal_type, resolve
 from relay_server.common.clock import Clock, Timer, cancel
-from relay_server.control.commands import NotDone
-from relay_server.http_sessions.loopback_client import GoalListener
-from relay_server.http_sessions.pool import PooledSession, SessionPool
-from relay_server.relay_node.view import view
-from relay_server.resources.etags import tag_of
-from relay_server.resources.page import PageQuery
-from relay_server.resources.service import RequestOrigin, RobotResourceService, see_online
-from relay_server.sessions.type_names import normal_type
+from relay_server.common.errors import NotDone
+from relay_server.common.etags import tag_of
+from relay_server.in_process_sessions.in_process_port import GoalListener
+from relay_server.in_process_sessions.pool import InProcessSessionPool, PooledSession, RobotCaller
+from relay_server.relay_node.visible_graph import visible_graph
+from relay_server.resources.page import TypedPageQuery
+from relay_server.resources.schemas import GoalPage
+from relay_server.resources.service import RobotResourceService, require_online
 
 FEEDBACK_BYTES = 256 * KIB
 RESULT_BYTES = MIB
-"""Longest that is kept, as JSON."""
+"""Largest stored size, as JSON."""
 
 
 class GoalState(enum.Enum):
-    """How far a goal has come."""
+    """The state of a goal."""
 
     ACTIVE = "active"
     CANCELLING = "cancelling"
-    """It is to end, and has not yet."""
+    """Cancelling was requested; it has not ended yet."""
     SUCCEEDED = "succeeded"
     CANCELED = "canceled"
     ABORTED = "aborted"
@@ -62,7 +62,7 @@ NEXT = {
 
 
 class GoalOwner(NamedTuple):
-    """For whom something is kept: a user, by tokens that are for the same."""
+    """The owner of a goal: a user, with tokens of the same scope."""
 
     user: int
     realm: str
@@ -70,33 +70,33 @@ class GoalOwner(NamedTuple):
 
     @classmethod
     def of(cls, principal: Principal) -> GoalOwner:
-        """For whom that of a principal is."""
+        """The owner for a principal."""
         scope = None if principal.scope is None else str(principal.scope)
         return cls(principal.user_id, principal.realm, scope)
 
 
 class GoalRequest(NamedTuple):
-    """What is asked of an action.
+    """A request to execute a goal.
 
     :param goal: JSON
-    :param type: of the action; empty for the one it has
-    :param unwatched: seconds for which nobody has to look at it
+    :param type: of the action; empty for its known type
+    :param poll_timeout: seconds without a poll after which the goal is cancelled
     """
 
     goal: bytes
     type: str = ""
-    unwatched: float = 10.0
+    poll_timeout: float = 10.0
 
 
 class HttpGoal(GoalListener):
-    """See the module's text.
+    """A goal given by HTTP; it is cancelled unless its owner keeps polling.
 
     :param wall: Unix time in seconds
-    :param guest: gives it, and is kept until it is over, or nobody looks at it
-    :param leave: ends that
-    :param moves: whether the robot counts it as motion
-    :param unwatched: seconds
-    :param on_end: called once, when it is over
+    :param pooled: session of the goal, kept until the goal has ended or is no longer polled
+    :param leave: gives the session back
+    :param moves: whether the robot counts the goal as motion
+    :param poll_timeout: seconds without a poll after which the goal is cancelled
+    :param on_end: called once, when the goal has ended
     :ivar version: grows with each change
     """
 
@@ -104,7 +104,7 @@ class HttpGoal(GoalListener):
         self,
         clock: Clock,
         wall: Callable[[], float],
-        guest: PooledSession,
+        pooled: PooledSession,
         leave: Callable[[], None],
         *,
         id: str,
@@ -112,12 +112,12 @@ class HttpGoal(GoalListener):
         action: str,
         type: str,
         moves: bool,
-        unwatched: float,
+        poll_timeout: float,
         on_end: Callable[[HttpGoal], None],
     ) -> None:
         self.id = id
         self.owner = owner
-        self.robot = guest.session.robot.name
+        self.robot = pooled.client.robot.name
         self.action = action
         self.type = type
         self.state = GoalState.ACTIVE
@@ -129,16 +129,16 @@ class HttpGoal(GoalListener):
         self.version = 0
         self._clock = clock
         self._wall = wall
-        self._guest: PooledSession | None = guest
+        self._pooled: PooledSession | None = pooled
         self._leave: Callable[[], None] | None = leave
         self._moves = moves
-        self._unwatched = unwatched
+        self._poll_timeout = poll_timeout
         self._on_end = on_end
-        self._operation = guest.client.new_id()
+        self._operation = pooled.port.new_id()
         self._why: str | None = None
-        """Why it was to end, where that was said here."""
-        self._looking = 0
-        self._deserting: Timer | None = None
+        """The reason of a cancellation over HTTP."""
+        self._polls = 0
+        self._poll_timer: Timer | None = None
         self._waiting: list[Deferred[None]] = []
 
     @property
@@ -148,21 +148,20 @@ class HttpGoal(GoalListener):
 
     @property
     def size(self) -> int:
-        """Bytes that are kept of it."""
+        """Bytes of its stored feedback and result."""
         return len(self.feedback_json or b"") + len(self.result_json or b"")
 
     # --- its life -----------------------------------------------------------------------------------------
 
-    def begin(self, args: bytes, since: int | None) -> Deferred[None]:
-        """Have it pursued; fires when it was handed on to who pursues it, or is over.
+    def begin(self, args: bytes, earliest_sent: int | None) -> Deferred[None]:
+        """Send the goal; fires when it was handed on to its executor, or has ended.
 
         :param args: JSON
-        :param since: as for :meth:`relay_server.http_sessions.loopback_client.LoopbackClient.do`
-        :raises SwitchboardError: it is refused, or can't be begun
+        :param earliest_sent: as for :meth:`relay_server.in_process_sessions.in_process_port.InProcessPort.perform`
+        :raises SwitchboardError: it is refused, or cannot begin
         """
-        assert self._guest is not None
-        session = self._guest.session
-        ask = rosbridge.SendActionGoal(
+        assert self._pooled is not None
+        operation = rosbridge.SendActionGoal(
             id=self._operation,
             action=self.action,
             action_type=self.type,
@@ -170,29 +169,29 @@ class HttpGoal(GoalListener):
             feedback=True,
         )
         try:
-            self._guest.client.pursue(ask, self, since)
+            self._pooled.port.send_goal(operation, self, earliest_sent)
         except SwitchboardError as error:
             if self.over:
-                # It was taken, and could not be begun.
+                # It was accepted, but could not begin.
                 raise NotDone(self.reason or str(error)) from None
             raise
-        self._mind()
-        return session.pursuing.beginning(self._operation)
+        self._watch()
+        return self._pooled.session.goals.begun(self._operation)
 
     def cancel(self, why: str) -> None:
-        """It is not wanted any more; its end still comes.
+        """Request its cancellation; its end is reported as usual.
 
-        :param why: in words
+        :param why: the reason
         """
-        if self.state is not GoalState.ACTIVE or self._guest is None:
+        if self.state is not GoalState.ACTIVE or self._pooled is None:
             return
         self._why = why
         self._become(GoalState.CANCELLING)
         with suppress(SwitchboardError):
-            self._guest.client.do(rosbridge.CancelActionGoal(id=self._operation, action=self.action))
+            self._pooled.port.perform(rosbridge.CancelActionGoal(id=self._operation, action=self.action))
 
     def feedback(self, values: bytes) -> None:
-        """It has come so far."""
+        """Store feedback, JSON."""
         if self.over:
             return
         fits = len(values) <= FEEDBACK_BYTES
@@ -201,18 +200,18 @@ class HttpGoal(GoalListener):
         self._become(self.state)
 
     def ended(self, status: int, result: bool, values: bytes) -> None:
-        """It is over."""
-        if self.over or self._guest is None:
+        """Store the end of the goal."""
+        if self.over or self._pooled is None:
             return
         state = _ENDS.get(GoalStatusCode(status), GoalState.ABORTED)
-        if self._guest.client.closed is not None:
-            # Whoever has his connection ended has his goals cancelled.
+        if self._pooled.port.closed is not None:
+            # The goals of a closed session are cancelled.
             state = GoalState.CANCELED
         words = None if result else str(jsontext.decode_any(values))
         if state is GoalState.CANCELED and self._why is not None:
             words = self._why
         elif words is None and state in (GoalState.CANCELED, GoalState.ABORTED):
-            words = self._explained(self._guest, state)
+            words = self._explained(self._pooled, state)
         if result and len(values) <= RESULT_BYTES:
             self.result_json = values
         elif result:
@@ -220,7 +219,7 @@ class HttpGoal(GoalListener):
         self.reason = words
         self.ended_at = self._wall()
         self._become(state)
-        self._let_go()
+        self._give_back()
         self._on_end(self)
 
     def _become(self, state: GoalState) -> None:
@@ -230,44 +229,44 @@ class HttpGoal(GoalListener):
         for each in waiting:
             each.callback(None)
 
-    def _let_go(self) -> None:
-        """The connection need not be kept for this."""
-        cancel(self._deserting)
-        self._deserting = None
+    def _give_back(self) -> None:
+        """Give the session back."""
+        cancel(self._poll_timer)
+        self._poll_timer = None
         leave, self._leave = self._leave, None
         if leave is not None:
             leave()
         if self.over:
-            self._guest = None
+            self._pooled = None
 
-    def _explained(self, guest: PooledSession, state: GoalState) -> str:
-        """Why it ended, where nobody has said so."""
-        session = guest.session
-        robot, standing = session.robot.name, session.desk.standing
+    def _explained(self, pooled: PooledSession, state: GoalState) -> str:
+        """The reason of its end, if the executor gave none."""
+        client = pooled.client
+        robot, standing = client.robot.name, client.controller.snapshot
         if standing.stopped is not None:
             why = f": {standing.stopped.why}" if standing.stopped.why else ""
             return f"robot {robot} was stopped by {standing.stopped.by}{why}"
-        if self._moves and not standing.lease.held_by(session):
-            holder = standing.lease.holder or standing.lease.coming
-            now = f"; {holder.client.name} has it" if holder is not None else ""
-            return f"control of robot {robot} was lost or given back{now}"
-        return "it was cancelled on the robot" if state is GoalState.CANCELED else "the robot gave it up"
+        if self._moves and not standing.lease.held_by(client):
+            holder = standing.lease.holder or standing.lease.pending_holder
+            now = f"; {holder.client.name} has control" if holder is not None else ""
+            return f"control of robot {robot} was lost or released{now}"
+        return "it was cancelled on the robot" if state is GoalState.CANCELED else "the robot aborted it"
 
-    # --- who looks at it ----------------------------------------------------------------------------------
+    # --- polling ------------------------------------------------------------------------------------------
 
     @contextmanager
-    def looked_at(self) -> Iterator[None]:
-        """Somebody looks at it, as long as the block lasts."""
-        self._looking += 1
-        cancel(self._deserting)
+    def polled(self) -> Iterator[None]:
+        """Count as polled while the block runs."""
+        self._polls += 1
+        cancel(self._poll_timer)
         try:
             yield
         finally:
-            self._looking -= 1
-            self._mind()
+            self._polls -= 1
+            self._watch()
 
     async def changed(self, version: int, seconds: float) -> None:
-        """Wait until it is another than it was, or so long."""
+        """Wait for another version, for so many seconds at most."""
         if self.version != version or seconds <= 0:
             return
         waiting: Deferred[None] = Deferred(self._waiting.remove)
@@ -279,7 +278,7 @@ class HttpGoal(GoalListener):
             cancel(timer)
 
     async def end_within(self, seconds: float) -> None:
-        """Wait until it is over, or so long."""
+        """Wait for its end, for so many seconds at most."""
         until = self._clock.seconds() + seconds
         while not self.over and (left := until - self._clock.seconds()) > 0:
             await self.changed(self.version, left)
@@ -289,22 +288,22 @@ class HttpGoal(GoalListener):
             self._waiting.remove(waiting)
             waiting.callback(None)
 
-    def _mind(self) -> None:
-        """End it when nobody looks at it for too long."""
-        if self._looking or self._leave is None:
+    def _watch(self) -> None:
+        """Start the timer that cancels the goal unless it is polled."""
+        if self._polls or self._leave is None:
             return
-        cancel(self._deserting)
-        self._deserting = self._clock.callLater(self._unwatched, self._deserted)
+        cancel(self._poll_timer)
+        self._poll_timer = self._clock.callLater(self._poll_timeout, self._on_poll_timeout)
 
-    def _deserted(self) -> None:
-        self._deserting = None
-        self.cancel(f"nobody has looked at it for {self._unwatched:g} s")
-        self._let_go()
+    def _on_poll_timeout(self) -> None:
+        self._poll_timer = None
+        self.cancel(f"its status was not requested for {self._poll_timeout:g} s")
+        self._give_back()
 
-    # --- how it is told -----------------------------------------------------------------------------------
+    # --- status -------------------------------------------------------------------------------------------
 
     def summary(self) -> dict[str, object]:
-        """All but how far it came and what came of it."""
+        """Its status without feedback and result."""
         ended = self.ended_at
         return {
             "id": self.id,
@@ -319,35 +318,37 @@ class HttpGoal(GoalListener):
     def json(self, whole: bool = True) -> bytes:
         """The status resource.
 
-        :param whole: with feedback and result
+        :param whole: whether to include feedback and result
         """
         hidden = None, None
         feedback, result = (self.feedback_json, self.result_json) if whole else hidden
         values = {"feedback": feedback, "result": result}
-        told = {name: None if each is None else msgspec.Raw(each) for name, each in values.items()}
-        return jsontext.encode({**self.summary(), **told})
+        status = {name: None if each is None else msgspec.Raw(each) for name, each in values.items()}
+        return jsontext.encode({**self.summary(), **status})
 
 
-def _too_long(what: str, values: bytes, most: int) -> str:
-    return f"{what} has {len(values)} bytes, and no more than {most} are kept; follow it by rosbridge"
+def _too_long(part: str, values: bytes, most: int) -> str:
+    return (
+        f"{part} has {len(values)} bytes, more than the {most} that are stored; use rosbridge to receive it"
+    )
 
 
 KEPT_SECONDS = 600.0
-"""Goals that are over can be read for so long."""
+"""Seconds for which an ended goal can be read."""
 
 KEPT = 64
 KEPT_BYTES = 4 * MIB
-"""Of one user, over all robots: the oldest go first, the newest stays."""
+"""Ended goals of one user on all robots: the oldest are dropped first, the newest stays."""
 
 UNDER_WAY = 64
-"""Goals of one user that may be, over all robots."""
+"""Most active goals of one user on all robots."""
 
 
 class GoalReply(NamedTuple):
     """A status resource.
 
     :param body: JSON
-    :param known: whether the asker has it already
+    :param known: whether the client has it already
     """
 
     body: bytes
@@ -361,7 +362,7 @@ class GoalReply(NamedTuple):
 
 
 class GoalStore:
-    """All goals that were given and can be read still."""
+    """All goals whose status can still be read."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -407,158 +408,194 @@ class GoalStore:
 
 
 class GoalService:
-    """Goals of those who come by HTTP.
+    """Goals that are given over HTTP.
 
     :param wall: Unix time in seconds
     """
 
     def __init__(
-        self, clock: Clock, guests: SessionPool, resources: RobotResourceService, wall: Callable[[], float]
+        self,
+        clock: Clock,
+        pool: InProcessSessionPool,
+        resources: RobotResourceService,
+        wall: Callable[[], float],
     ) -> None:
         self._clock = clock
-        self._guests = guests
+        self._pool = pool
         self._resources = resources
         self._wall = wall
-        self._book = GoalStore(clock)
+        self._store = GoalStore(clock)
 
-    async def give(self, asker: RequestOrigin, name: str, ask: GoalRequest, moment: int | None) -> HttpGoal:
-        """Have a goal pursued; it is under way then.
+    async def give(
+        self, caller: RobotCaller, name: str, request: GoalRequest, earliest_sent: int | None
+    ) -> HttpGoal:
+        """Begin a goal; it is active when this returns.
 
-        :param moment: the relay's monotonic nanoseconds before which it can't have been asked for
-        :raises MomentNeeded: it moves the robot, and no moment is named
-        :raises TooOld: it moves the robot, and may be too old
-        :raises NotDone: it can't begin, with the reason
+        :param earliest_sent: earliest time of the request, the relay's monotonic nanoseconds
+        :raises FreshnessTokenRequired: it moves the robot, and the request has no freshness token
+        :raises FreshnessTokenExpired: it moves the robot, and the request may be too old
+        :raises NotDone: it cannot begin, with the reason
         :raises SwitchboardError: it is refused
         """
         action = resolve(name)
-        type_name = normal_type(ask.type, "action")
-        guest, leave = await self._guests.keep(*asker)
+        type_name = normal_type(request.type, "action")
+        pooled, leave = await self._pool.keep(caller)
         with ExitStack() as undone:
             undone.callback(leave)
-            goal, begins = self._begin(asker, guest, leave, action, type_name, ask, moment)
+            goal, begins = self._begin(caller, pooled, leave, action, type_name, request, earliest_sent)
             undone.pop_all()
-        with goal.looked_at():
+        with goal.polled():
             await begins
         if goal.state is GoalState.REFUSED:
-            self._book.remove(goal)
+            self._store.remove(goal)
             raise NotDone(goal.reason or "the goal could not begin")
         return goal
 
     def _begin(
         self,
-        asker: RequestOrigin,
-        guest: PooledSession,
+        caller: RobotCaller,
+        pooled: PooledSession,
         leave: Callable[[], None],
         action: str,
         type_name: str,
-        ask: GoalRequest,
-        moment: int | None,
+        request: GoalRequest,
+        earliest_sent: int | None,
     ) -> tuple[HttpGoal, Deferred[None]]:
-        session, owner = guest.session, GoalOwner.of(asker.principal)
-        session.judge(Operation.CALL, action)
-        see_online(session)
-        known = view(session).actions.get(action)
+        client, owner = pooled.client, GoalOwner.of(caller.principal)
+        client.require(Operation.CALL, action)
+        require_online(client)
+        known = visible_graph(client).actions.get(action)
         if not type_name and known is None:
-            raise NotFound(f"there is no action {action} on robot {session.robot.name}")
-        moves = session.robot.description.motion.moves_by_action(action)
-        since = self._resources.dated(guest, moment) if moves else None
-        self._book.check_room(owner.user)
+            raise NotFound(f"there is no action {action} on robot {client.robot.name}")
+        moves = client.robot.description.motion.moves_by_action(action)
+        checked = self._resources.check_freshness(pooled, earliest_sent) if moves else None
+        self._store.check_room(owner.user)
         goal = HttpGoal(
             self._clock,
             self._wall,
-            guest,
+            pooled,
             leave,
-            # In the order in which they are given, and nobody guesses one.
+            # Sorted by time, and not guessable.
             id=f"{round(self._wall() * 1000):012x}{secrets.token_hex(16)}",
             owner=owner,
             action=action,
             type=known.types[0] if known is not None and known.types else type_name,
             moves=moves,
-            unwatched=ask.unwatched,
-            on_end=self._book.ended,
+            poll_timeout=request.poll_timeout,
+            on_end=self._store.ended,
         )
-        self._book.add(goal)
+        self._store.add(goal)
         try:
-            return goal, goal.begin(ask.goal, since)
+            return goal, goal.begin(request.goal, checked)
         except SwitchboardError:
-            self._book.remove(goal)
+            self._store.remove(goal)
             raise
 
-    async def members(self, asker: RequestOrigin, listing: PageQuery) -> dict[str, Any]:
-        """A page of the asker's own, in the order in which they were given, without feedback and results.
+    async def members(self, caller: RobotCaller, listing: TypedPageQuery) -> GoalPage:
+        """A page of the client's own goals, oldest first, without feedback and results.
 
         :param listing: names and types are those of actions
         :raises NotFound: no such robot, or no right on it
         """
-        mine = self._book.of(GoalOwner.of(asker.principal), asker.robot)
+        mine = self._store.of(GoalOwner.of(caller.principal), caller.robot)
         if not mine:
-            async with self._guests.permit(*asker):
+            async with self._pool.permit(caller):
                 pass
-        meant = {id: goal for id, goal in mine.items() if fnmatchcase(goal.action, listing.name)}
-        page, after = listing._replace(name="*").page(meant, lambda goal: [goal.type])
-        return {"goals": [goal.summary() for _, goal in page], "next": after}
+        matching = {id: goal for id, goal in mine.items() if fnmatchcase(goal.action, listing.name)}
+        page, after = msgspec.structs.replace(listing, name="*").page(matching, lambda goal: [goal.type])
+        return cast(GoalPage, {"goals": [goal.summary() for _, goal in page], "next": after})
 
-    def find(self, asker: RequestOrigin, id: str) -> HttpGoal:
-        """One of the asker's own.
+    def find(self, caller: RobotCaller, id: str) -> HttpGoal:
+        """One of the client's own goals.
 
         :raises NotFound: there is none
         """
-        goal = self._book.of(GoalOwner.of(asker.principal), asker.robot).get(id)
+        goal = self._store.of(GoalOwner.of(caller.principal), caller.robot).get(id)
         if goal is None:
-            raise NotFound("there is no such goal of yours, or none any more")
+            raise NotFound("you have no such goal, or it is no longer stored")
         return goal
 
-    async def told(self, asker: RequestOrigin, goal: HttpGoal) -> GoalReply:
-        """Its status; without feedback and result where the asker may not use the action any more."""
-        # While it is under way it ends with the right.
-        whole = not goal.over or await self._may(asker, goal)
+    async def status(self, caller: RobotCaller, goal: HttpGoal) -> GoalReply:
+        """The status of a goal, without feedback and result if the client lost the right to the action."""
+        # An active goal ends with the right.
+        whole = not goal.over or await self._may(caller, goal)
         return GoalReply(goal.json(whole), goal.over)
 
-    async def state(self, asker: RequestOrigin, id: str, wait: float, unlike: frozenset[str]) -> GoalReply:
-        """Its status, which counts as a look at it.
+    async def state(self, caller: RobotCaller, id: str, wait: float, unlike: frozenset[str]) -> GoalReply:
+        """The status of a goal; this counts as polling.
 
-        :param wait: seconds for which another may be waited for than those that are known
-        :param unlike: entity tags of these
+        :param wait: seconds to wait for another status than those in ``unlike``
+        :param unlike: entity tags of the statuses that the client has
         :raises NotFound: there is no such goal
         """
-        goal = self.find(asker, id)
+        goal = self.find(caller, id)
         until = self._clock.seconds() + wait
-        with goal.looked_at():
+        with goal.polled():
             while True:
                 version = goal.version
-                told = await self.told(asker, goal)
-                if told.etag not in unlike:
-                    return told
+                status = await self.status(caller, goal)
+                if status.etag not in unlike:
+                    return status
                 left = until - self._clock.seconds()
-                if left <= 0 or told.over:
-                    return told._replace(known=True)
+                if left <= 0 or status.over:
+                    return status._replace(known=True)
                 await goal.changed(version, left)
 
-    async def awaited(self, asker: RequestOrigin, id: str, wait: float) -> GoalReply | None:
-        """Its status when it is over, or after so many seconds; ``None`` when it can't be read any more."""
+    async def awaited(self, caller: RobotCaller, id: str, wait: float) -> GoalReply | None:
+        """The status at its end, or after so many seconds; ``None`` if it is no longer stored."""
         try:
-            goal = self.find(asker, id)
+            goal = self.find(caller, id)
         except NotFound:
             return None
-        with goal.looked_at():
+        with goal.polled():
             await goal.end_within(wait)
-        return await self.told(asker, goal)
+        return await self.status(caller, goal)
 
-    def cancel(self, asker: RequestOrigin, id: str) -> HttpGoal | None:
-        """Have one end; ``None`` when it is over already.
+    def cancel(self, caller: RobotCaller, id: str) -> HttpGoal | None:
+        """Cancel a goal; ``None`` if it has already ended.
 
         :raises NotFound: there is no such goal
         """
-        goal = self.find(asker, id)
+        goal = self.find(caller, id)
         if goal.over:
             return None
-        with goal.looked_at():
-            goal.cancel("it was cancelled by who gave it")
+        with goal.polled():
+            goal.cancel("its owner cancelled it")
         return goal
 
-    async def _may(self, asker: RequestOrigin, goal: HttpGoal) -> bool:
+    async def result(
+        self, caller: RobotCaller, name: str, args: bytes, seconds: float, earliest_sent: int | None
+    ) -> bytes:
+        """Have a goal executed, and wait for it: its result, JSON. One that has not ended in time is cancelled.
+
+        :param args: of the goal, JSON
+        :raises NotDone: it did not succeed in time, with the reason
+        :raises SwitchboardError: as :meth:`give`
+        """
+        goal = await self.give(caller, name, GoalRequest(args), earliest_sent)
         try:
-            await self._resources.may(asker, Operation.CALL, goal.action)
+            with goal.polled():
+                await goal.end_within(seconds)
+        finally:
+            # Also when the client disconnects.
+            if not goal.over:
+                goal.cancel(f"it had not ended within {seconds:g} s")
+        if goal.state is not GoalState.SUCCEEDED or goal.result_json is None:
+            raise NotDone(
+                goal.reason or f"the goal is {goal.state.value}: it had not ended within {seconds:g} s"
+            )
+        return goal.result_json
+
+    def cancel_all(self, caller: RobotCaller, name: str) -> None:
+        """Cancel all goals of the caller for an action."""
+        action = resolve(name)
+        for goal in self._store.of(GoalOwner.of(caller.principal), caller.robot).values():
+            if goal.action == action and not goal.over:
+                goal.cancel("its owner cancelled it")
+
+    async def _may(self, caller: RobotCaller, goal: HttpGoal) -> bool:
+        try:
+            await self._resources.may(caller, Operation.CALL, goal.action)
         except (NotFound, Refused):
             return False
         return True

@@ -1,56 +1,50 @@
-"""A page of a collection: which of its members, by name and type, and where the next page begins."""
+"""Pages of a collection: members by name and type, and the beginning of the next page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from relay_protocol.errors import Invalid
+import msgspec
+from msgspec import Meta
+
 from relay_protocol.limits import NAME
-from relay_protocol.wildcards import see_cheap
+from relay_protocol.wildcards import check_pattern
 
 T = TypeVar("T")
 
 PAGE = 100
-"""Members of a page of which nobody says how long it should be."""
+"""Members of a page by default."""
 
 LONGEST = 1000
 
 
-class PageQuery(NamedTuple):
-    """What is asked of a collection.
+Text = Annotated[str, Meta(max_length=NAME)]
 
-    :param name: pattern with shell wildcards
-    :param type: of the members
-    :param after: the name behind which the page begins
-    :param limit: most members of the page
+
+class PageQuery(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Query for a page of a collection.
+
+    :param name: a name, with shell wildcards
+    :param limit: most members of the page; 100 by default
+    :param after: ``next`` of the page before
     """
 
-    name: str = "*"
-    type: str = ""
-    after: str = ""
-    limit: int = PAGE
+    name: Text = "*"
+    after: Text = ""
+    limit: Annotated[int, Meta(ge=1, le=LONGEST)] = PAGE
 
-    @classmethod
-    def of(cls, query: Mapping[str, str], *, typed: bool = True) -> PageQuery:
-        """From the parameters of a request.
+    def __post_init__(self) -> None:
+        check_pattern(self.name)
 
-        :param typed: whether the members have types to be asked for by
-        :raises Invalid: one that there is not, or with a value that it can't have
-        """
-        see_known(query, *(each for each in cls._fields if typed or each != "type"))
-        if any(len(each) > NAME for each in query.values()):
-            raise Invalid(f"a parameter may have {NAME} characters at most")
-        text = query.get("limit", str(PAGE))
-        if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= LONGEST:
-            raise Invalid(f"'limit' must be a number from 1 to {LONGEST}")
-        return cls(
-            see_cheap(query.get("name", "*")), query.get("type", ""), query.get("after", ""), int(text)
-        )
+    @property
+    def wanted_type(self) -> str:
+        """The type that members must have, or empty."""
+        return ""
 
     def page(self, members: Mapping[str, T], types: Any) -> tuple[list[tuple[str, T]], str]:
-        """The members meant, in the order of their names, and the name behind which there are more, or ``""``.
+        """The members of the page, by name, and ``after`` of the next page, or ``""``.
 
         :param types: gives the types of a member
         """
@@ -59,17 +53,21 @@ class PageQuery(NamedTuple):
             for name, each in sorted(members.items())
             if name > self.after
             and fnmatchcase(name, self.name)
-            and (not self.type or self.type in types(each))
+            and (not self.wanted_type or self.wanted_type in types(each))
         ]
         more = found[self.limit - 1][0] if len(found) > self.limit else ""
         return found[: self.limit], more
 
 
-def see_known(query: Mapping[str, str], *names: str) -> None:
-    """See that the parameters of a request are some of these.
+class TypedPageQuery(PageQuery, frozen=True, forbid_unknown_fields=True):
+    """Query for a page of a collection whose members have types.
 
-    :raises Invalid: there is another one
+    :param type: a type
     """
-    strange = query.keys() - set(names)
-    if strange:
-        raise Invalid(f"there is no parameter '{min(strange)[:40]}'; there are {', '.join(names)}")
+
+    type: Text = ""
+
+    @property
+    def wanted_type(self) -> str:
+        """The type that members must have, or empty."""
+        return self.type

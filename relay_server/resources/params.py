@@ -4,60 +4,49 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
-
-from relay_protocol import jsontext
-from relay_protocol.errors import NotFound, Refused
-from relay_server.control.commands import NotDone
-from relay_server.http_sessions.pool import PooledSession
-
-SECONDS = 10.0
-"""A node has so long to answer."""
+from relay_protocol.errors import NotFound
+from relay_server.common.errors import NotDone
+from relay_server.in_process_sessions.pool import PooledSession
 
 
-async def names(guest: PooledSession) -> list[str]:
+async def names(pooled: PooledSession) -> list[str]:
     """All there are, as ``<node>:<parameter>``."""
-    found: list[str] = (await _ask(guest, "get_param_names"))["names"]
+    found: list[str] = (await _ask(pooled, "get_param_names"))["names"]
     return found
 
 
-async def value(guest: PooledSession, name: str) -> bytes:
+async def value(pooled: PooledSession, name: str) -> bytes:
     """JSON of one.
 
     :raises NotFound: there is none
     """
-    said = await _ask(guest, "get_param", name=name)
-    if not said["successful"]:
-        raise NotFound(str(said["reason"]) or f"there is no parameter {name}")
-    return str(said["value"]).encode()
+    answer = await _ask(pooled, "get_param", name=name)
+    if not answer["successful"]:
+        raise NotFound(str(answer["reason"]) or f"there is no parameter {name}")
+    return str(answer["value"]).encode()
 
 
-async def set_value(guest: PooledSession, name: str, json: bytes) -> None:
-    """Set one.
+async def set_value(pooled: PooledSession, name: str, json: bytes) -> None:
+    """Set a parameter.
 
     :param json: any JSON
-    :raises NotDone: its node says why not
+    :raises NotDone: its node refuses, with the reason
     """
-    _see(await _ask(guest, "set_param", name=name, value=json.decode()))
+    _check(await _ask(pooled, "set_param", name=name, value=json.decode()))
 
 
-async def remove(guest: PooledSession, name: str) -> None:
-    """Delete one.
+async def remove(pooled: PooledSession, name: str) -> None:
+    """Delete a parameter.
 
-    :raises NotDone: its node says why not
+    :raises NotDone: its node refuses, with the reason
     """
-    _see(await _ask(guest, "delete_param", name=name))
+    _check(await _ask(pooled, "delete_param", name=name))
 
 
-async def _ask(guest: PooledSession, service: str, **args: Any) -> Any:
-    answer = await guest.client.call(
-        f"/rosapi/{service}", msgspec.Raw(jsontext.encode(args)), timeout=SECONDS
-    )
-    if not answer.result:
-        raise Refused(str(answer.read))
-    return answer.read
+async def _ask(pooled: PooledSession, service: str, **args: Any) -> Any:
+    return await pooled.port.call_own(f"/rosapi/{service}", args)
 
 
-def _see(said: Any) -> None:
-    if not said["successful"]:
-        raise NotDone(str(said["reason"]))
+def _check(answer: Any) -> None:
+    if not answer["successful"]:
+        raise NotDone(str(answer["reason"]))

@@ -1,4 +1,7 @@
-"""What HTTP asks about a robot's resources, done by a connection that is judged as any client's is."""
+"""A robot's resources for HTTP and Roles.
+
+Each request uses a session in this process, so its caller needs the same rights as by a websocket.
+"""
 
 from __future__ import annotations
 
@@ -15,62 +18,54 @@ from twisted.python.failure import Failure
 from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.link import Service, Topic
 from relay_protocol.rights import Operation
-from relay_server.access import Principal
-from relay_server.channels.robot_link import resolve
-from relay_server.common.clock import Clock, shield, with_timeout
+from relay_server.channels.names import resolve
+from relay_server.common.clock import Clock
+from relay_server.common.concurrency import FairLock, shield, with_timeout
 from relay_server.common.database import BoundedThreadPool
-from relay_server.common.fair_lock import FairLock
-from relay_server.common.freshness_tokens import NEEDED, FreshnessTokenExpired, FreshnessTokenRequired
-from relay_server.control.commands import NotDone
-from relay_server.http_sessions.one_shot_publisher import OneShotPublisher, may_move, type_of
-from relay_server.http_sessions.pool import PooledSession, SessionPool
+from relay_server.common.errors import NotDone, NothingReceived
+from relay_server.common.etags import PreconditionFailed, check_match
+from relay_server.common.freshness_tokens import HEADER, NEEDED, FreshnessTokenExpired, FreshnessTokenRequired
+from relay_server.in_process_sessions.one_shot_publisher import OneShotPublisher, may_move, type_of
+from relay_server.in_process_sessions.pool import InProcessSessionPool, PooledSession, RobotCaller
 from relay_server.relay_node.interfaces import RELAY, ROSAPI
-from relay_server.relay_node.view import view
+from relay_server.relay_node.visible_graph import visible_graph
 from relay_server.resources import params
-from relay_server.resources.etags import ParamState, PreconditionFailed, TopicState, see_match
-from relay_server.resources.page import PageQuery
-from relay_server.resources.topic_context import TopicContext, topic_context
+from relay_server.resources.page import TypedPageQuery
+from relay_server.resources.states import ParamState, TopicContext, TopicState, topic_context
 from relay_server.resources.topic_stream import TopicStream
 from relay_server.robots.registry import RobotState
-from relay_server.sessions.service_calls import RESUME, moves_by
-from relay_server.sessions.session import Session
+from relay_server.sessions.context import ClientContext
+from relay_server.sessions.service_calls import RESUME
 from relay_server.sessions.session_quota import SessionQuota
-from relay_server.video.ports import NoFrame
 
 T = TypeVar("T")
 
 READY_SECONDS = 5.0
-"""A robot has so long to begin publishing a topic."""
+"""Seconds that a robot has to begin publishing a topic."""
 
 KINDS = ("topics", "services", "actions")
 """Collections that are in the robot's graph."""
 
 
-class RequestOrigin(NamedTuple):
-    """Who asks, of which robot, from where."""
+class MessageConditions(NamedTuple):
+    """Which message of a topic is an answer.
 
-    principal: Principal
-    robot: str
-    address: str
-
-
-class TopicQuery(NamedTuple):
-    """Which state of a topic is wanted.
-
-    :param wait: seconds for which it may be waited
-    :param max_age: seconds since the relay got it, at most; ``None`` for however long
-    :param unlike: entity tags of those that are known already
+    :param wait: seconds to wait for a message
+    :param max_age: largest age in seconds since the relay received it; ``None`` for any
+    :param unlike: entity tags of the states that the client has
+    :param next: wait for a message that comes from now on; when none came in time, the newest one
     """
 
     wait: float = 2.0
     max_age: float | None = None
     unlike: frozenset[str] = frozenset()
+    next: bool = False
 
 
 class RobotResourceService:
-    """See the module's text.
+    """Topics, services, actions and parameters of robots.
 
-    :param threads: do what takes long, one piece at a time
+    :param threads: convert to and from RDF, one document at a time
     :param clock_ns: the relay's monotonic nanoseconds
     :param wall: Unix time in seconds
     """
@@ -78,114 +73,117 @@ class RobotResourceService:
     def __init__(
         self,
         clock: Clock,
-        guests: SessionPool,
+        pool: InProcessSessionPool,
         threads: BoundedThreadPool,
         clock_ns: Callable[[], int],
         wall: Callable[[], float],
     ) -> None:
         self._clock = clock
-        self._guests = guests
+        self._pool = pool
         self._threads = threads
         self._clock_ns = clock_ns
         self._wall = wall
-        self._turns = FairLock()
+        self._fair_lock = FairLock()
         self._changing: WeakValueDictionary[tuple[int, str], DeferredLock] = WeakValueDictionary()
 
-    async def members(self, asker: RequestOrigin, kind: str, listing: PageQuery) -> dict[str, Any]:
+    async def members(self, caller: RobotCaller, kind: str, listing: TypedPageQuery) -> dict[str, Any]:
         """A page of one of :data:`KINDS`.
 
         :raises NotFound: no such robot, or no right on it
         """
-        async with self._guests.at(*asker) as guest:
-            robot = guest.session.robot
-            members = getattr(view(guest.session), kind)
+        async with self._pool.at(caller) as pooled:
+            robot = pooled.client.robot
+            members = getattr(visible_graph(pooled.client), kind)
             page, after = listing.page(members, lambda each: each.types)
             return {
-                kind: [_told(robot, kind, name, each) for name, each in page],
+                kind: [_listed(robot, kind, name, each) for name, each in page],
                 "next": after,
-                "online": robot.control is not None,
+                "online": robot.control_link is not None,
             }
 
-    async def member(self, asker: RequestOrigin, kind: str, name: str) -> dict[str, Any]:
-        """One member of one of :data:`KINDS`, as the page with it tells of it.
+    async def member(self, caller: RobotCaller, kind: str, name: str) -> dict[str, Any]:
+        """One member of one of :data:`KINDS`, as in its page.
 
         :raises NotFound: no such robot or member, or no right on it
-        :raises Unavailable: the robot is offline, so that nobody knows
+        :raises Unavailable: the robot is offline
         """
-        async with self._guests.at(*asker) as guest:
+        async with self._pool.at(caller) as pooled:
             resource = resolve(name)
-            seen = view(guest.session)
-            found = seen.topic(resource) if kind == "topics" else getattr(seen, kind).get(resource)
+            visible = visible_graph(pooled.client)
+            found = visible.topic(resource) if kind == "topics" else getattr(visible, kind).get(resource)
             if found is None:
-                raise _nothing(guest.session, kind, resource)
-            return _told(guest.session.robot, kind, resource, found)
+                raise _not_found(pooled.client, kind, resource)
+            return _listed(pooled.client.robot, kind, resource, found)
 
-    async def see(self, asker: RequestOrigin) -> None:
-        """See that somebody has a right on a robot.
+    async def check_may_know(self, caller: RobotCaller) -> None:
+        """Check that the caller has a right on a robot.
 
         :raises NotFound: no such robot, or no right on it
         """
-        async with self._guests.permit(*asker):
+        async with self._pool.permit(caller):
             pass
 
-    async def state(self, asker: RequestOrigin, name: str, wanted: TopicQuery) -> tuple[TopicState, bool]:
-        """The newest state of a topic, and whether it is known already, since there is none but those that are.
+    async def newest_message(self, caller: RobotCaller, name: str, wanted: MessageConditions) -> TopicState:
+        """The newest message of a topic: the one that the client has if no other came in time.
 
         :raises NotFound: no such robot or topic, or no right on it
-        :raises Refused: the topic may not be heard
+        :raises Refused: the client may not subscribe to the topic
         :raises Unavailable: the robot is offline
-        :raises NothingCame: nobody has said anything there in time
+        :raises NothingReceived: no message was received in time
         """
-        async with self._guests.at(*asker) as guest:
+        async with self._pool.at(caller) as pooled:
             topic = resolve(name)
-            type_name = known_type(guest.session, topic)
-            feed = guest.feed(topic, type_name)
+            type_name = visible_type(pooled.client, topic)
+            latest = pooled.subscribe(topic, type_name)
             until = self._clock.seconds() + wanted.wait
             known: TopicState | None = None
             number = 0
+            if wanted.next:
+                number = await latest.poll(wanted.wait)
+                until = self._clock.seconds()
             while True:
                 now = self._clock.seconds()
-                heard = await feed.after(number, max(0.0, until - now))
-                guest.client.check(topic)
-                if heard is None:
+                message = await latest.after(number, max(0.0, until - now))
+                pooled.port.check(topic)
+                if message is None:
                     break
-                number = heard.number
+                number = message.number
                 now = self._clock.seconds()
-                if wanted.max_age is not None and now - heard.at > wanted.max_age:
+                if wanted.max_age is not None and now - message.at > wanted.max_age:
                     continue
-                state = TopicState(topic, type_name, self._wall() - (now - heard.at), heard.body)
+                state = TopicState(topic, type_name, self._wall() - (now - message.at), message.body)
                 if state.etag not in wanted.unlike:
-                    return state, False
+                    return state
                 known = state
                 if wanted.wait <= 0:
                     break
             if known is not None:
-                return known, True
-            # The right to hear it may have been withdrawn meanwhile.
-            guest.feed(topic, type_name)
-            raise NoFrame(f"nobody has said anything on {topic} within {wanted.wait:g} s")
+                return known
+            # The right to subscribe may have been revoked meanwhile.
+            pooled.subscribe(topic, type_name)
+            raise NothingReceived(f"no message on {topic} was received within {wanted.wait:g} s")
 
-    async def background(self, asker: RequestOrigin, state: TopicState) -> TopicContext:
-        """What is to be known of a topic beside its state."""
-        async with self._guests.at(*asker) as guest:
-            return await topic_context(guest.session, state.topic, state.type)
+    async def topic_context(self, caller: RobotCaller, state: TopicState) -> TopicContext:
+        """Facts about a topic that its representation in RDF needs."""
+        async with self._pool.at(caller) as pooled:
+            return await topic_context(pooled.client, state.topic, state.type)
 
-    async def made(self, asker: RequestOrigin, work: Callable[[], T]) -> T:
-        """Do something in a thread, on the account of who asks for it.
+    async def convert(self, caller: RobotCaller, work: Callable[[], T]) -> T:
+        """Do something in a thread, and charge it to the CPU quota of the caller.
 
-        :raises Refused: he has used up his share of the processor, now or when it would be his turn
-        :raises Unavailable: too much waits already, of his or of all; or the relay goes down
+        :raises Refused: the quota is used up, now or when the work would begin
+        :raises Unavailable: too much work waits, of this user or of all; or the relay shuts down
         """
-        async with self._guests.at(*asker) as guest:
-            share = guest.session.share
-            share.check()
-            making = Deferred.fromCoroutine(self._counted(asker.principal.user_id, share, work))
-            # To the end, so that it is counted for who leaves before.
+        async with self._pool.at(caller) as pooled:
+            quota = pooled.client.quota
+            quota.check()
+            making = Deferred.fromCoroutine(self._counted(caller.principal.user_id, quota, work))
+            # The work runs to its end, so it is charged even if the client disconnects.
             waiting = shield(making)
-            making.addErrback(_nobody_waits)
+            making.addErrback(_ignore_refusal)
             return await waiting
 
-    async def _counted(self, user: int, share: SessionQuota, work: Callable[[], T]) -> T:
+    async def _counted(self, user: int, quota: SessionQuota, work: Callable[[], T]) -> T:
         spent = 0.0
 
         def timed() -> T:
@@ -196,184 +194,200 @@ class RobotResourceService:
             finally:
                 spent = time.thread_time() - began
 
-        async with self._turns.turn(user):
-            # Again: what was made meanwhile may have used it up.
-            share.check()
+        async with self._fair_lock.hold(user):
+            # Checked again: other work may have used the quota up meanwhile.
+            quota.check()
             try:
                 return await self._threads.run(timed)
             finally:
-                share.took(spent)
+                quota.count_elsewhere(spent)
 
     @asynccontextmanager
     async def follow(
-        self, asker: RequestOrigin, name: str, throttle_ms: float, tell: Callable[[bytes], None]
+        self,
+        caller: RobotCaller,
+        name: str,
+        throttle_ms: float,
+        send: Callable[[bytes], None],
+        send_status: Callable[[str, str], None],
+        *,
+        whole: bool = False,
     ) -> AsyncIterator[TopicStream]:
-        """Have every message of a topic told, as long as the block lasts.
+        """Pass every message of a topic to ``send`` while the block runs.
 
-        :param throttle_ms: least time between two; the newest counts
-        :raises SwitchboardError: as :meth:`state`
+        :param throttle_ms: least time between two messages; the newest counts
+        :param send_status: takes level and text of a status: why messages are missing
+        :param whole: pass each as in :meth:`relay_server.resources.states.TopicState.json`
+        :raises SwitchboardError: as :meth:`newest_message`
         """
-        async with self._guests.visit(*asker) as (session, client):
+        async with self._pool.unshared(caller) as port:
             topic = resolve(name)
-            following = TopicStream(session, client, topic)
-            following.begin(known_type(session, topic), throttle_ms, tell)
-            yield following
+            type_name, stream = visible_type(port.client, topic), TopicStream(port, topic)
+
+            def send_whole(body: bytes) -> None:
+                send(TopicState(topic, type_name, self._wall(), body).json())
+
+            stream.begin(type_name, throttle_ms, send_whole if whole else send, send_status)
+            yield stream
 
     async def publish(
-        self, asker: RequestOrigin, name: str, body: msgspec.Raw, type_name: str, moment: int | None
-    ) -> None:
-        """Say something on a topic.
+        self, caller: RobotCaller, name: str, body: msgspec.Raw, type_name: str, earliest_sent: int | None
+    ) -> str:
+        """Publish a message.
 
         :param body: JSON of the message
-        :param type_name: of the topic; empty for the one it has
-        :param moment: the relay's monotonic nanoseconds before which it can't have been asked for
-        :raises MomentNeeded: it moves the robot, and no moment is named
-        :raises TooOld: it moves the robot, and may be too old
-        :raises SwitchboardError: it is refused, or can't be done
+        :param type_name: of the topic; empty for its known type
+        :param earliest_sent: earliest time of the request, the relay's monotonic nanoseconds
+        :returns: a warning that messages of this client to the topic were dropped; empty: none since the last one
+        :raises FreshnessTokenRequired: it moves the robot, and the request has no freshness token
+        :raises FreshnessTokenExpired: it moves the robot, and the request may be too old
+        :raises SwitchboardError: it is refused, or not possible
         """
-        async with self._guests.at(*asker) as guest:
-            topic, session = resolve(name), guest.session
-            session.judge(Operation.PUBLISH, topic)
-            speaker = OneShotPublisher(self._clock, guest.client, session, topic)
-            if session.robot.control is None:
-                # Which refuses it. Who commands a robot that is away has to let go when it is back.
-                speaker.say_now(body, moment)
-            named = type_of(session, topic, type_name)
-            if not may_move(session, topic, named):
-                saying, late = speaker.say(body, named), f"the robot does not publish {topic} in time"
-                await with_timeout(self._clock, READY_SECONDS, saying, late)
-                return
+        async with self._pool.at(caller) as pooled:
+            topic, client = resolve(name), pooled.client
+            client.require(Operation.PUBLISH, topic)
+            publisher = OneShotPublisher(self._clock, pooled.port, topic)
+            if client.robot.control_link is None:
+                # This refuses the message, and notes that the client must release the controls when the robot is back.
+                publisher.publish_now(body, earliest_sent)
+            named = type_of(client, topic, type_name)
+            if not may_move(client, topic, named):
+                published = publisher.publish(body, named)
+                late = f"the robot did not begin to publish {topic} within {READY_SECONDS:g} s; try again"
+                await with_timeout(self._clock, READY_SECONDS, published, late)
+                return publisher.take_warning()
             try:
-                since = self.dated(guest, moment)
+                checked = self.check_freshness(pooled, earliest_sent)
             except Refused:
-                # It counts as a command in vain all the same.
+                # It still counts as a rejected command.
                 with suppress(SwitchboardError):
-                    speaker.advertise(named)
-                    speaker.say_now(body, moment)
+                    publisher.advertise(named)
+                    publisher.publish_now(body, earliest_sent)
                 raise
-            left = session.robot.description.motion.deadline_ms / 1000 - (self._clock_ns() - since) / 1e9
-            await speaker.command(body, named, since, left)
+            left = client.robot.description.motion.deadline_ms / 1000 - (self._clock_ns() - checked) / 1e9
+            await publisher.publish_command(body, named, checked, left)
+            return publisher.take_warning()
 
     async def call(
         self,
-        asker: RequestOrigin,
+        caller: RobotCaller,
         name: str,
         args: msgspec.Raw,
         type_name: str,
         seconds: float,
-        moment: int | None,
+        earliest_sent: int | None,
     ) -> bytes:
-        """Call a service; JSON of what it answers.
+        """Call a service; the JSON of its answer.
 
         :param args: JSON
-        :param seconds: it may take
-        :raises MomentNeeded: it moves the robot or lets it move again, and no moment is named
-        :raises NotDone: it has not answered, or says why not
+        :param seconds: timeout
+        :raises FreshnessTokenRequired: it moves or resumes the robot, and the request has no freshness token
+        :raises NotDone: the service did not answer, or failed with a reason
         :raises SwitchboardError: as :meth:`publish`
         """
-        async with self._guests.at(*asker) as guest:
+        async with self._pool.at(caller) as pooled:
             service = resolve(name)
-            if not type_name and service not in view(guest.session).services:
-                raise _nothing(guest.session, "services", service)
-            if service == RESUME and moment is None:
-                raise FreshnessTokenRequired(f"this lets the robot move again: {NEEDED}")
-            if moves_by(guest.session.robot.description.motion, service):
-                self.dated(guest, moment)
-            answer = await guest.client.call(service, args, type_name, seconds, moment)
+            if not type_name and service not in visible_graph(pooled.client).services:
+                raise _not_found(pooled.client, "services", service)
+            if service == RESUME and earliest_sent is None:
+                raise FreshnessTokenRequired(f"this resumes the robot: {NEEDED}")
+            if pooled.client.robot.description.motion.moves_by_service(service):
+                self.check_freshness(pooled, earliest_sent)
+            answer = await pooled.port.call(service, args, type_name, seconds, earliest_sent)
             if not answer.result:
                 raise NotDone(str(answer.read))
             return bytes(answer.values)
 
-    async def may(self, asker: RequestOrigin, operation: Operation, name: str) -> None:
-        """See that something may be done now, without doing it.
+    async def may(self, caller: RobotCaller, operation: Operation, name: str) -> None:
+        """Check that something may be done now, without doing it.
 
         :raises NotFound: no such robot, or no right on it
         :raises Refused: it may not
         """
         resource = resolve(name)
-        async with self._guests.permit(*asker) as permit:
-            verdict = permit.judge(operation, resource)
-        # The relay's own services are open to all who have a right on the robot.
+        async with self._pool.permit(caller) as permit:
+            decision = permit.decide(operation, resource)
+        # Any right on the robot is enough for the relay's own services.
         own = operation is Operation.CALL and resource.startswith((f"{RELAY}/", f"{ROSAPI}/"))
-        if not (verdict.allowed or own):
-            raise Refused(verdict.reason)
+        if not (decision.allowed or own):
+            raise Refused(decision.reason)
 
     # --- parameters ---------------------------------------------------------------------------------------
 
-    async def params(self, asker: RequestOrigin, listing: PageQuery) -> dict[str, Any]:
+    async def params(self, caller: RobotCaller, listing: TypedPageQuery) -> dict[str, Any]:
         """A page of the names of parameters.
 
-        :raises SwitchboardError: as :meth:`state`
+        :raises SwitchboardError: as :meth:`newest_message`
         """
-        async with self._guests.at(*asker) as guest:
-            members = dict.fromkeys(await params.names(guest), "")
+        async with self._pool.at(caller) as pooled:
+            members = dict.fromkeys(await params.names(pooled), "")
             page, after = listing.page(members, lambda each: [each])
             return {"params": [{"name": name} for name, _ in page], "next": after}
 
-    async def param(self, asker: RequestOrigin, name: str) -> ParamState:
+    async def param(self, caller: RobotCaller, name: str) -> ParamState:
         """A parameter.
 
         :param name: ``<node>:<parameter>``
         :raises NotFound: there is none
         """
-        async with self._guests.at(*asker) as guest:
-            return ParamState(name, await params.value(guest, name))
+        async with self._pool.at(caller) as pooled:
+            return ParamState(name, await params.value(pooled, name))
 
-    async def set_param(self, asker: RequestOrigin, name: str, json: bytes, match: str | None) -> None:
+    async def set_param(self, caller: RobotCaller, name: str, json: bytes, match: str | None) -> None:
         """Set a parameter.
 
         :param match: only if it still has this value: entity tags, as in ``If-Match``
-        :raises NotAsBefore: it has another
-        :raises NotDone: its node says why not
+        :raises PreconditionFailed: it has another value
+        :raises NotDone: its node refuses, with the reason
         """
-        async with self._guests.at(*asker) as guest, self._alone_with(guest, name):
-            await self._see_same(guest, name, match)
-            await params.set_value(guest, name, json)
+        async with self._pool.at(caller) as pooled, self._change_lock(pooled, name):
+            await self._check_precondition(pooled, name, match)
+            await params.set_value(pooled, name, json)
 
-    async def remove_param(self, asker: RequestOrigin, name: str, match: str | None) -> None:
+    async def remove_param(self, caller: RobotCaller, name: str, match: str | None) -> None:
         """Delete a parameter; see :meth:`set_param`."""
-        async with self._guests.at(*asker) as guest, self._alone_with(guest, name):
-            await self._see_same(guest, name, match)
-            await params.remove(guest, name)
+        async with self._pool.at(caller) as pooled, self._change_lock(pooled, name):
+            await self._check_precondition(pooled, name, match)
+            await params.remove(pooled, name)
 
-    def _alone_with(self, guest: PooledSession, name: str) -> DeferredLock:
-        """While it is held nobody else changes that parameter by HTTP: what was seen of it still holds.
+    def _change_lock(self, pooled: PooledSession, name: str) -> DeferredLock:
+        """Lock a parameter against other HTTP requests, so that a checked precondition still holds.
 
-        Nodes, and clients of ``/rosapi/set_param``, are not kept from it.
+        Nodes, and clients of ``/rosapi/set_param``, can still change it.
         """
-        key = guest.session.robot.robot_id, name.lstrip("/")
+        key = pooled.client.robot.robot_id, name.lstrip("/")
         return self._changing.setdefault(key, DeferredLock())
 
     @staticmethod
-    async def _see_same(guest: PooledSession, name: str, match: str | None) -> None:
+    async def _check_precondition(pooled: PooledSession, name: str, match: str | None) -> None:
         if match is None:
             return
         try:
-            found = ParamState(name, await params.value(guest, name))
+            found = ParamState(name, await params.value(pooled, name))
         except NotFound as error:
             raise PreconditionFailed(str(error)) from None
-        see_match(found.etag, match)
+        check_match(found.etag, match)
 
-    def dated(self, guest: PooledSession, moment: int | None) -> int:
-        """When something that moves the robot can have been asked for at the earliest.
+    def check_freshness(self, pooled: PooledSession, earliest_sent: int | None) -> int:
+        """Check the age of a request that moves the robot; returns the earliest time at which it can have been sent.
 
-        :param moment: the relay's monotonic nanoseconds, as the asker names it
-        :raises MomentNeeded: he does not
-        :raises TooOld: that is too long ago
+        :param earliest_sent: the relay's monotonic nanoseconds, by the freshness token
+        :raises FreshnessTokenRequired: the request has no freshness token
+        :raises FreshnessTokenExpired: the request may be too old
         """
-        if moment is None:
+        if earliest_sent is None:
             raise FreshnessTokenRequired(f"this moves the robot: {NEEDED}")
-        age_ms = (self._clock_ns() - moment) / 1e6
-        deadline_ms = guest.session.robot.description.motion.deadline_ms
+        age_ms = (self._clock_ns() - earliest_sent) / 1e6
+        deadline_ms = pooled.client.robot.description.motion.deadline_ms
         if age_ms > deadline_ms:
             raise FreshnessTokenExpired(
-                f"this may have been sent {age_ms:.0f} ms ago; the robot takes nothing older than {deadline_ms} ms. "
-                "Give back the 'switchboard-moment' of this answer"
+                f"this may have been sent {age_ms:.0f} ms ago; the robot accepts nothing older than {deadline_ms} ms. "
+                f"Send it again with the '{HEADER}' of this answer"
             )
-        return moment
+        return earliest_sent
 
 
-def _told(robot: RobotState, kind: str, name: str, member: Topic | Service) -> dict[str, Any]:
+def _listed(robot: RobotState, kind: str, name: str, member: Topic | Service) -> dict[str, Any]:
     """A member as it is listed."""
     motion = robot.description.motion
     moves = {
@@ -384,34 +398,34 @@ def _told(robot: RobotState, kind: str, name: str, member: Topic | Service) -> d
     return {"name": name, **msgspec.to_builtins(member), "moves": moves[kind]()}
 
 
-def _nothing(session: Session, kind: str, name: str) -> NotFound:
-    """What is said of what there is not, or not for who asks.
+def _not_found(client: ClientContext, kind: str, name: str) -> NotFound:
+    """The error for a resource that does not exist, or is hidden from the client.
 
     :raises Unavailable: the robot is offline
     """
-    see_online(session)
-    what = kind.removesuffix("s")
-    return NotFound(f"there is no {what} {name} on robot {session.robot.name}, or you have no right on it")
+    require_online(client)
+    noun = kind.removesuffix("s")
+    return NotFound(f"there is no {noun} {name} on robot {client.robot.name}, or you have no right on it")
 
 
-def _nobody_waits(failure: Failure) -> None:
-    """Why something was not made, when who asked has left: that is no failure of the relay."""
+def _ignore_refusal(failure: Failure) -> None:
+    """Ignore errors of work whose client has disconnected: the relay did not fail."""
     failure.trap(SwitchboardError, CancelledError)
 
 
-def known_type(session: Session, topic: str) -> str:
-    """The type of a topic that the asker may know of.
+def visible_type(client: ClientContext, topic: str) -> str:
+    """The type of a topic that the client may subscribe or publish to.
 
-    :raises NotFound: there is none
+    :raises NotFound: there is none, or the client has neither right on it
     :raises Unavailable: the robot is offline
     """
-    known = view(session).topic(topic)
+    known = visible_graph(client).topic(topic)
     if known is not None and known.types:
         return known.types[0]
-    raise _nothing(session, "topics", topic)
+    raise _not_found(client, "topics", topic)
 
 
-def see_online(session: Session) -> None:
+def require_online(client: ClientContext) -> None:
     """:raises Unavailable: the robot is offline"""
-    if session.robot.control is None:
-        raise Unavailable(f"robot {session.robot.name} is offline")
+    if client.robot.control_link is None:
+        raise Unavailable(f"robot {client.robot.name} is offline")

@@ -1,14 +1,14 @@
-"""The edge towards robots: bytes of one TCP or TLS connection become frames and messages (SPEC section 2).
+"""Robots' connections: the bytes of one TCP or TLS connection become frames and messages (SPEC 2).
 
-A connection begins in the role of :class:`Opening`. What the robot proves decides its role from then on: a control
-link or the link of a channel.
+A connection begins with a :class:`~relay_server.robots.link_handlers.HandshakeHandler`. The handshake decides its
+further handler: control link, channel link, or link of a camera stream.
 """
 
 from __future__ import annotations
 
 import socket
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -23,45 +23,53 @@ from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
 from relay_protocol.frames import (
     COMMAND,
+    COMMAND_HEAD,
     JSON,
     JSON_NUMBER,
     SAMPLE,
+    SAMPLE_HEAD,
     CommandFrame,
+    FilePart,
     Frame,
     FrameDecoder,
     JsonFrame,
-    PicturePart,
     SampleFrame,
     VideoFrame,
-    encode_command,
+    VideoFramePart,
     encode_part,
-    encode_sample,
+    pack_command_head,
+    pack_sample_head,
 )
 from relay_server.common.clock import Clock, Timer, cancel, looping
 from relay_server.common.pacing import Pacer
-from relay_server.common.push_producer import PushProducer
 from relay_server.common.send_queue import SEGMENT, SendQueue
 from relay_server.common.socket_writer import FlushScheduler, TransportWriter, writer_for
-from relay_server.common.tcp import tcp_of
-from relay_server.http.connection_limits import ConnectionLimits, Slot
+from relay_server.common.tcp import PushProducer, tcp_of
+from relay_server.http.limits import ConnectionLimits, Slot
 from relay_server.robots.link_quality import LinkQuality, LinkQualityMeter
 
 PINGS = 256
-"""Pings without an answer that are remembered."""
+"""Most unanswered pings that are remembered."""
 
 REPLACED_SECONDS = 2.0
-"""A link that a newer one has replaced is closed after so long at most."""
+"""Most seconds until a replaced link is closed."""
 
 REQUEST_BYTES = 6 * limits.MIB
-"""Calls, goals and answers of clients that may wait for a robot: one of the largest (:data:`limits.COMMAND_FRAME`), and
-some small ones. A call that finds no room is refused to its caller, and the channel goes on."""
+"""Most bytes of clients' calls, goals and answers that wait for a robot.
+
+That is one of the largest (:data:`limits.RELAY_JSON_FRAME`) and some small ones. Further calls are refused.
+"""
 
 MEASURED_SECONDS = 1.0
-"""A link whose quality is told is pinged at least so often."""
+"""Most seconds between pings of a link whose quality is shown."""
 
 
-class LinkRole(Protocol):
-    """What a robot's connection is for, at the moment."""
+ON_EVERY_LINK = (link.Ping, link.Pong, link.Bye)
+"""Messages that :meth:`RobotConnection.common_message` handles."""
+
+
+class LinkHandler(Protocol):
+    """Handles what one connection of a robot receives: messages and frames."""
 
     def message(self, body: bytes) -> None:
         """A JSON message.
@@ -72,15 +80,22 @@ class LinkRole(Protocol):
     def sample(self, frame: SampleFrame) -> None:
         """A topic sample.
 
-        :raises PeerError: it has no place here
+        :raises PeerError: this handler takes none
         """
 
-    def picture(self, frame: VideoFrame | PicturePart) -> None:
-        """A picture or a part of one; few roles take any.
+    def video_frame(self, frame: VideoFrame | VideoFramePart) -> None:
+        """A camera frame or a part of one. Only the handler of a camera stream takes them.
 
-        :raises PeerError: it is none, or has no place here
+        :raises PeerError: this handler takes none
         """
-        raise MalformedMessage("pictures have a link of their own")
+        raise MalformedMessage("camera frames go over the link of a camera stream")
+
+    def file_part(self, frame: FilePart) -> None:
+        """A part of a file. Only the handler of a file link takes them.
+
+        :raises PeerError: this handler takes none
+        """
+        raise MalformedMessage("files go over the file link")
 
     def lost(self, reason: str) -> None:
         """The connection has ended."""
@@ -88,7 +103,7 @@ class LinkRole(Protocol):
 
 @dataclass(frozen=True)
 class LinkTiming:
-    """What can be set of a robot's connection.
+    """Settings of robots' connections.
 
     :param heartbeat: seconds between pings
     :param largest_sample: bytes of the largest sample a robot may send in parts
@@ -99,12 +114,12 @@ class LinkTiming:
 
 
 class RobotConnection(TwistedProtocol):
-    """One connection of a robot, whatever its role.
+    """One connection of a robot, whichever link it is.
 
     :param clock: for deadlines and heartbeats
-    :param clock_ns: the relay's monotonic clock, told to robots in ``pong`` and ``joined``
-    :param first_role: makes the role a new connection begins with
-    :param turns: shared by all robots' connections
+    :param clock_ns: the relay's monotonic clock in nanoseconds, sent to robots in ``pong`` and ``joined``
+    :param first_handler: makes the handler with which a new connection begins
+    :param flushes: shared by all robots' connections
     """
 
     log = Logger()
@@ -116,31 +131,34 @@ class RobotConnection(TwistedProtocol):
         clock: Clock,
         clock_ns: Callable[[], int],
         timing: LinkTiming,
-        first_role: Callable[[RobotConnection], LinkRole],
-        cap: ConnectionLimits,
-        turns: FlushScheduler | None = None,
+        first_handler: Callable[[RobotConnection], LinkHandler],
+        connection_limits: ConnectionLimits,
+        flushes: FlushScheduler | None = None,
     ) -> None:
         self._clock = clock
-        self._turns = turns or FlushScheduler(clock)
+        self._flushes = flushes or FlushScheduler(clock)
         self.clock_ns = clock_ns
         self.timing = timing
-        self._cap = cap
+        self._limits = connection_limits
         self._decoder = FrameDecoder(limits.HANDSHAKE_FRAME)
-        self._role: LinkRole | None = first_role(self)
+        self._handler: LinkHandler | None = first_handler(self)
         self._deadline: Timer | None = None
-        self._place: Slot | None = None
-        self._unproven_bytes = 0
+        self._slot: Slot | None = None
+        self._unauthenticated_bytes = 0
         self._waiting: deque[Frame] = deque()
-        self._busy = False
-        self._heard = clock.seconds()
-        self._beating = looping(clock, self._beat)
+        self._suspended = False
+        self._last_received = clock.seconds()
+        self._heartbeat = looping(clock, self._beat)
         self._aborting: Timer | None = None
         self._pings: OrderedDict[int, Deferred[float] | None] = OrderedDict()
         self._meter = LinkQualityMeter()
         self._answered = 0
         self.on_round_trip: Callable[[float], None] = lambda seconds: None
-        self._outbox = SendQueue(_nowhere, clock.seconds, self._overflow, REQUEST_BYTES)
+        self._send_queue = SendQueue(_not_connected, clock.seconds, self._overflow, REQUEST_BYTES)
         self._pacer: Pacer | None = None
+        self._replies: deque[bytes] = deque()
+        self.reply_bytes = 0
+        """Bytes of replies that wait."""
         self.address = ""
 
     # --- Twisted ------------------------------------------------------------------------------------------
@@ -149,57 +167,65 @@ class RobotConnection(TwistedProtocol):
         """A robot has dialled."""
         self.address = getattr(self.transport.getPeer(), "host", "")
         harden(self.transport)
-        self._writer = writer_for(self.transport, self._turns)
-        self._outbox.write = self._writer.write
+        self._writer = writer_for(self.transport, self._flushes)
+        self._send_queue.write = self._writer.write
         self.transport.registerProducer(PushProducer(self), True)
-        if not self._cap.enter(self.address):
+        if not self._limits.enter(self.address):
             self.refuse(link.Refused(reason="too many connections from your address", retry_after=10.0))
             return
-        self._place = self._cap.stranger()
-        if self._place is None:
+        self._slot = self._limits.unauthenticated()
+        if self._slot is None:
             self.refuse(link.Refused(reason="too many robots dial at the same time", retry_after=10.0))
             return
-        self._deadline = self._clock.callLater(limits.UNPROVEN_SECONDS, self._too_late)
+        self._deadline = self._clock.callLater(limits.UNAUTHENTICATED_SECONDS, self._not_authenticated)
 
     def dataReceived(self, data: bytes) -> None:
         """Bytes from the robot."""
-        if self._role is None:
+        if self._handler is None:
             return
-        self._heard = self._clock.seconds()
+        self._last_received = self._clock.seconds()
         if self._deadline is not None:
-            self._unproven_bytes += len(data)
-            if self._unproven_bytes > limits.UNPROVEN_BYTES:
-                self._break(MalformedMessage(f"more than {limits.UNPROVEN_BYTES} bytes before the proof"))
+            self._unauthenticated_bytes += len(data)
+            if self._unauthenticated_bytes > limits.UNAUTHENTICATED_BYTES:
+                self._protocol_broken(
+                    MalformedMessage(f"more than {limits.UNAUTHENTICATED_BYTES} bytes before the proof")
+                )
                 return
         try:
             self._waiting += self._decoder.feed(data)
-            self._work()
+            self._handle_frames()
         except PeerError as error:
-            self._break(error)
+            self._protocol_broken(error)
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """The connection is gone."""
-        self._cap.leave(self.address)
-        self._known()
+        self._limits.leave(self.address)
+        self._release_slot()
         cancel(self._aborting)
         self._end(reason.getErrorMessage())
 
     @property
     def ended(self) -> bool:
-        """Whether the connection is gone, or on its way out."""
-        return self._role is None
+        """Whether the connection is closed, or is being closed."""
+        return self._handler is None
 
-    # --- for roles ----------------------------------------------------------------------------------------
+    # --- for handlers --------------------------------------------------------------------------------------
 
     def pace(self, *, parts: bool) -> None:
-        """Keep little on its way to the robot, so that pings and commands wait for little.
+        """Bound what is in flight to the robot, so that pings and commands arrive soon.
 
-        :param parts: whether the robot takes samples in parts
+        :param parts: whether the robot accepts samples in parts
         """
         tcp = tcp_of(self.transport)
-        pieces = _Parts if parts else _Whole
+        pieces = _FrameParts if parts else _WholeFrame
         self._pacer = Pacer(
-            self._writer, self._outbox, self._clock, self._turns.stalls.seconds, self._probe, pieces, tcp
+            self._writer,
+            self._send_queue,
+            self._clock,
+            self._flushes.stalls.seconds,
+            self._probe,
+            pieces,
+            tcp,
         )
 
     def _probe(self) -> None:
@@ -207,88 +233,139 @@ class RobotConnection(TwistedProtocol):
 
     def pause(self) -> None:
         """The transport's buffer is full."""
-        self._outbox.pause()
+        self._send_queue.pause()
 
     def resume(self) -> None:
-        """The transport takes bytes again."""
-        self._outbox.resume()
+        """The transport's buffer has room again."""
+        self._send_queue.resume()
         if self._pacer is not None:
-            self._pacer.go_on()
+            self._pacer.continue_sending()
+        self._write_replies()
 
     def send(self, message: link.Message) -> None:
         """Queue a message that must not be lost.
 
-        :raises Unavailable: it is a call, a goal or an answer, and too much waits for a slow robot already
+        :raises Unavailable: it is a call, a goal or an answer, and a slow robot's queue is full
         """
         frame = link.frame(message)
-        if isinstance(message, _OF_CLIENTS) and not self._takes(message, len(frame)):
+        if isinstance(message, _OF_CLIENTS) and not self._has_room(message, len(frame)):
             raise Unavailable("the robot's link is too slow for what waits for it already; try again later")
-        # A ping that counted against the budget would ask for another one.
-        if self._role is not None and self._outbox.paused_since is None and isinstance(message, _AHEAD):
-            self._writer.urgent(frame)
+        # Such a message does not count against the budget; a ping that did would cause another one.
+        if (
+            self._handler is not None
+            and self._send_queue.paused_since is None
+            and isinstance(message, _OVERTAKING)
+        ):
+            self._writer.write_beyond_budget(frame)
         else:
-            self._outbox.control(frame)
+            self._send_queue.send_reliable(frame)
 
-    def _takes(self, message: link.Message, size: int) -> bool:
-        """Whether there is room for what clients ask; a short answer finds it always."""
-        return (size <= SEGMENT and not isinstance(message, _ASKED)) or self._outbox.has_room(size)
+    def _has_room(self, message: link.Message, size: int) -> bool:
+        """Whether the queue has room for a client's message. A short answer always has."""
+        return (size <= SEGMENT and not isinstance(message, _REQUESTS)) or self._send_queue.has_room(size)
 
-    def sample(self, number: int, stamp: int, body: bytes) -> None:
-        """Queue a sample; when the robot is slow the newest survive."""
-        frame = encode_sample(number, stamp, body)
-        if self._outbox.passing:
-            self._outbox.write(frame)
-        else:
-            self._outbox.data(number, frame)
+    def report_drops(self, on_drop: Callable[[Hashable, int], None]) -> None:
+        """Report each message that is dropped because the link is slow.
 
-    def command(self, number: int, stamp: int, source: int, body: bytes) -> None:
-        """The same of a command, with the connection it comes from."""
-        frame = encode_command(number, stamp, source, body)
-        if self._outbox.passing:
-            self._outbox.write(frame)
-        else:
-            self._outbox.data(number, frame, commands=True)
+        :param on_drop: called with the number of its publication, or another key of the send queue, and the number of
+            the client's connection
+        """
+        self._send_queue.on_drop = on_drop
+
+    def message_sender(
+        self, number: int, convert: Callable[[bytes], bytes] = bytes, *, commands: bool
+    ) -> Callable[[int, int, bytes], None]:
+        """The function that frames and sends messages of one publication; a slow robot gets only the newest.
+
+        Nearly all messages to robots are sent by it, so it frames them with as few calls as possible.
+
+        :param convert: converts a body to the robot's encoding; ``bytes``: bodies are in that encoding
+        :returns: a function of ``earliest_sent`` (the stamp of the frame), the number of the client's connection
+            (sent with commands only, but reported of all that is dropped), and the body; it raises what ``convert``
+            raises
+        """
+        queue = self._send_queue
+
+        def send_command(earliest_sent: int, source: int, body: bytes) -> None:
+            body = convert(body)
+            frame = pack_command_head(len(body) + COMMAND_HEAD, COMMAND, number, earliest_sent, source) + body
+            if queue.passing:
+                queue.write(frame)
+                return
+            queue.send_droppable(number, frame, commands=True, source=source)
             if self._pacer is not None:
-                self._pacer.commands()
+                self._pacer.send_commands()
 
-    def newest(self, key: str, message: link.Message) -> None:
-        """Queue a message of which, under one key, only the newest must survive."""
-        self._outbox.data(key, link.frame(message), 1)
+        def send_sample(earliest_sent: int, source: int, body: bytes) -> None:
+            body = convert(body)
+            frame = pack_sample_head(len(body) + SAMPLE_HEAD, SAMPLE, number, earliest_sent) + body
+            if queue.passing:
+                queue.write(frame)
+            else:
+                queue.send_droppable(number, frame, source=source)
+
+        return send_command if commands else send_sample
+
+    def send_sample(self, number: int, body: bytes) -> None:
+        """Queue a sample, in place of one of the same number that waits."""
+        frame = pack_sample_head(len(body) + SAMPLE_HEAD, SAMPLE, number, 0) + body
+        self._send_queue.send_droppable(number, frame, 1)
+
+    def send_reply(self, number: int, body: bytes) -> None:
+        """Send a sample that must not be lost, also if it is large: it waits until the connection has room."""
+        if self._handler is None:
+            return
+        # An older sample of this number is of no use after its reply.
+        self._send_queue.forget(number)
+        frame = pack_sample_head(len(body) + SAMPLE_HEAD, SAMPLE, number, 0) + body
+        self._replies.append(frame)
+        self.reply_bytes += len(frame)
+        self._write_replies()
+
+    def _write_replies(self) -> None:
+        while self._replies and self._send_queue.passing:
+            frame = self._replies.popleft()
+            self.reply_bytes -= len(frame)
+            self._send_queue.write(frame)
+
+    def send_newest(self, key: str, message: link.Message) -> None:
+        """Queue a message that replaces an older one with the same key."""
+        self._send_queue.send_droppable(key, link.frame(message), 1)
 
     def close(self, reason: str) -> None:
-        """Say ``bye`` and end the connection."""
-        if self._role is not None:
+        """Send ``bye`` and end the connection."""
+        if self._handler is not None:
             self.send(link.Bye(reason=reason))
             self._hang_up(reason)
 
-    def replaced(self, reason: str, answers: Callable[[], None]) -> None:
-        """Say ``bye``, and end the connection as soon as the robot may have answered one more ping.
+    def close_replaced(self, reason: str, answers: Callable[[], None]) -> None:
+        """Send ``bye``, and end the connection once the robot had time to answer one more ping.
 
-        :param answers: called if it does
+        :param answers: called if it answers
         """
-        if self._role is None:
+        if self._handler is None:
             return
 
         def alive(_: float) -> None:
             answers()
             self._hang_up(reason)
 
-        self._role.lost(reason)
-        self._role = _Replaced(self)
-        if self._beating.running:
-            self._beating.stop()
+        self._handler.lost(reason)
+        self._handler = _Replaced(self)
+        if self._heartbeat.running:
+            self._heartbeat.stop()
         self.round_trip().addCallbacks(alive, lambda _: None)
         self.send(link.Bye(reason=reason))
         self._aborting = self._clock.callLater(REPLACED_SECONDS, self._hang_up, reason)
 
     def finish(self, reason: str) -> None:
-        """All is said; end the connection."""
-        if self._role is not None:
+        """End the connection after what is queued."""
+        if self._handler is not None:
             self._hang_up(reason)
 
     def refuse(self, refusal: link.Refused) -> None:
-        """Say no in words and end the connection."""
-        if self._role is not None:
+        """Send a refusal and end the connection."""
+        if self._handler is not None:
             self.log.info(
                 "a robot at {address} is refused: {reason}",
                 address=self.address,
@@ -298,68 +375,72 @@ class RobotConnection(TwistedProtocol):
             self.send(refusal)
             self._hang_up(refusal.reason)
 
-    def proven(
-        self, role: LinkRole, frame_limit: int, *, measured: bool = False, sample_limit: int = 0
+    def set_handler(
+        self, handler: LinkHandler, frame_limit: int, *, measured: bool = False, sample_limit: int = 0
     ) -> None:
-        """The robot is known; from now on the connection has this role, heartbeats run both ways.
+        """Set the handler of the connection, as the robot has proved its identity, and start heartbeats.
 
-        :param sample_limit: bytes of the largest sample that may come in parts; 0 for what fits into a frame
-        :param measured: whether :meth:`reading` is going to be asked for
+        :param sample_limit: bytes of the largest sample accepted in parts; 0 if samples must fit into a frame
+        :param measured: whether :meth:`link_quality` is used
         """
-        self._role = role
+        self._handler = handler
         self._decoder.limit = frame_limit
         self._decoder.sample_limit = sample_limit
-        self._known()
+        self._release_slot()
         self._stop_deadline()
         often = min(self.timing.heartbeat, MEASURED_SECONDS) if measured else self.timing.heartbeat
-        self._beating.start(often, now=True)
+        self._heartbeat.start(often, now=True)
 
     def wait_for(self, work: Deferred[None]) -> None:
-        """Hold further frames until ``work`` is done."""
-        self._busy = True
+        """Handle no further frames until ``work`` is done."""
+        self._suspended = True
         self.transport.pauseProducing()
-        work.addErrback(self._broken_work)
-        work.addBoth(self._go_on)
+        work.addErrback(self._work_failed)
+        work.addBoth(self._resume_handling)
 
     def round_trip(self) -> Deferred[float]:
-        """Ping the robot; seconds, or :class:`Unavailable` when the connection ends first."""
+        """Ping the robot; fires with seconds, or fails with :class:`Unavailable` when the connection ends first."""
         waiting: Deferred[float] = Deferred()
         self._ping(waiting)
         return waiting
 
-    def reading(self) -> LinkQuality:
-        """How good the way to the robot is."""
+    def link_quality(self) -> LinkQuality:
+        """The quality of the link to the robot."""
         now = self.clock_ns()
-        # Answers keep their order: what was asked before the latest that was answered is not waited for.
+        # Answers keep their order, so pings older than the latest answered one will not be answered.
         out = [(now - sent) / 1e9 for sent in self._pings if sent > self._answered]
-        return self._meter.reading(now / 1e9, out)
+        return self._meter.link_quality(now / 1e9, out)
 
     # --- inside -------------------------------------------------------------------------------------------
 
-    def _work(self) -> None:
+    def _handle_frames(self) -> None:
         waiting = self._waiting
-        while waiting and not self._busy and self._role is not None:
+        while waiting and not self._suspended and self._handler is not None:
             frame = waiting.popleft()
             if isinstance(frame, SampleFrame):
-                self._role.sample(frame)
+                self._handler.sample(frame)
             elif isinstance(frame, JsonFrame):
-                self._role.message(frame.body)
+                self._handler.message(frame.body)
             elif isinstance(frame, CommandFrame):
                 raise MalformedMessage("commands go from the relay to the robot only")
+            elif isinstance(frame, FilePart):
+                self._handler.file_part(frame)
             else:
-                self._role.picture(frame)
+                self._handler.video_frame(frame)
 
-    def heartbeat(self, message: link.Ping | link.Pong) -> None:
-        """Ping and pong are the same in every role."""
-        if isinstance(message, link.Ping):
+    def common_message(self, message: link.Ping | link.Pong | link.Bye) -> None:
+        """Handle a message that is the same on every link."""
+        if isinstance(message, link.Bye):
+            self.close("bye")
+        elif isinstance(message, link.Ping):
             self.send(link.Pong(t=message.t, at=self.clock_ns()))
         elif message.t in self._pings:
             if self._pacer is not None:
-                self._pacer.answered(message.t)
+                self._pacer.probe_answered(message.t)
             waiting = self._pings.pop(message.t)
             now = self.clock_ns()
             seconds = (now - message.t) / 1e9
-            self._meter.came_back(now / 1e9, seconds)
+            self._meter.answered(now / 1e9, seconds)
             self._answered = max(self._answered, message.t)
             self.on_round_trip(seconds)
             if waiting is not None:
@@ -371,18 +452,18 @@ class RobotConnection(TwistedProtocol):
             now += 1
         self._pings[now] = waiting
         while len(self._pings) > PINGS:
-            self._give_up(self._pings.popitem(last=False)[1])
+            self._ping_failed(self._pings.popitem(last=False)[1])
         if self._pacer is not None:
-            self._pacer.probing(now)
+            self._pacer.probe_sent(now)
         self.send(link.Ping(t=now))
 
     @staticmethod
-    def _give_up(waiting: Deferred[float] | None) -> None:
+    def _ping_failed(waiting: Deferred[float] | None) -> None:
         if waiting is not None:
             waiting.errback(Unavailable("the robot did not answer, or lost its connection"))
 
     def _beat(self) -> None:
-        silent = self._clock.seconds() - self._heard
+        silent = self._clock.seconds() - self._last_received
         if silent > self.timing.heartbeat * limits.HEARTBEATS_MISSED:
             self.log.info(
                 "robot at {address} is silent for {silent:.1f} s", address=self.address, silent=silent
@@ -392,34 +473,36 @@ class RobotConnection(TwistedProtocol):
             return
         self._ping(None)
 
-    def _too_late(self) -> None:
+    def _not_authenticated(self) -> None:
         self._deadline = None
         self.refuse(
-            link.Refused(reason=f"no proof of identity within {limits.UNPROVEN_SECONDS:g} s", retry_after=5.0)
+            link.Refused(
+                reason=f"no proof of identity within {limits.UNAUTHENTICATED_SECONDS:g} s", retry_after=5.0
+            )
         )
 
-    def _broken_work(self, failure: Failure) -> None:
+    def _work_failed(self, failure: Failure) -> None:
         error = failure.value
         if isinstance(error, PeerError):
-            self._break(error)
+            self._protocol_broken(error)
         elif isinstance(error, SwitchboardError):
             retry = 5.0 if isinstance(error, Unavailable) else None
             self.refuse(link.Refused(reason=str(error), code=error.code, retry_after=retry))
         else:
             self.log.failure("opening a robot's link failed", failure)
-            self.refuse(link.Refused(reason="the relay failed; its log tells more", retry_after=5.0))
+            self.refuse(link.Refused(reason="the relay failed; see its log", retry_after=5.0))
 
-    def _go_on(self, _: Any) -> None:
-        self._busy = False
+    def _resume_handling(self, _: Any) -> None:
+        self._suspended = False
         if self.ended:
             return
         self.transport.resumeProducing()
         try:
-            self._work()
+            self._handle_frames()
         except PeerError as error:
-            self._break(error)
+            self._protocol_broken(error)
 
-    def _break(self, error: PeerError) -> None:
+    def _protocol_broken(self, error: PeerError) -> None:
         self.log.warn(
             "the robot at {address} broke the protocol: {reason}",
             address=self.address,
@@ -439,66 +522,72 @@ class RobotConnection(TwistedProtocol):
         self.transport.loseConnection()
 
     def _end(self, reason: str) -> None:
-        role, self._role = self._role, None
+        handler, self._handler = self._handler, None
         self._stop_deadline()
         if self._pacer is not None:
             self._pacer.stop()
-        self._outbox.close()
+        self._send_queue.drop_data()
+        self._send_queue.close()
+        self._replies.clear()
+        self.reply_bytes = 0
         self._waiting.clear()
-        if self._beating.running:
-            self._beating.stop()
+        if self._heartbeat.running:
+            self._heartbeat.stop()
         pings, self._pings = self._pings, OrderedDict()
         for waiting in pings.values():
-            self._give_up(waiting)
-        if role is not None:
-            role.lost(reason)
+            self._ping_failed(waiting)
+        if handler is not None:
+            handler.lost(reason)
 
-    def _known(self) -> None:
-        if self._place is not None:
-            self._place.give_back()
+    def _release_slot(self) -> None:
+        if self._slot is not None:
+            self._slot.release()
 
     def _stop_deadline(self) -> None:
         cancel(self._deadline)
         self._deadline = None
 
     def _overflow(self) -> None:
-        self.log.warn("the robot at {address} takes nothing; it is cut", address=self.address)
-        self._end("the robot takes nothing")
+        self.log.warn("the robot at {address} accepts no data and is disconnected", address=self.address)
+        self._end("the robot accepts no data")
         self.transport.abortConnection()
 
 
-class _Replaced(LinkRole):
-    """The link of a robot that has a newer one: only the answer to a ping counts."""
+class _Replaced(LinkHandler):
+    """A link that was replaced: only the answer to a ping is read."""
 
     def __init__(self, connection: RobotConnection) -> None:
         self._connection = connection
 
     def message(self, body: bytes) -> None:
-        """What is no answer to a ping is passed over."""
+        """Handle the answer to a ping; ignore all else."""
         message = jsontext.decode(link.robot_control_decoder, body)
         if isinstance(message, link.Pong):
-            self._connection.heartbeat(message)
+            self._connection.common_message(message)
 
     def sample(self, frame: SampleFrame) -> None:
-        """Passed over."""
+        """Ignored."""
 
-    def picture(self, frame: VideoFrame | PicturePart) -> None:
-        """Passed over."""
+    def video_frame(self, frame: VideoFrame | VideoFramePart) -> None:
+        """Ignored."""
 
     def lost(self, reason: str) -> None:
-        """It had been given up before."""
+        """Nothing is left to do."""
 
 
-_AHEAD = (link.Ping, link.Pong, link.Bye, link.Refused)
-"""Messages that do not wait for what a thin link has yet to carry."""
+_OVERTAKING = (link.Ping, link.Pong, link.Bye, link.Refused)
+"""Messages that overtake the queue of a slow link.
 
-_ASKED = (link.CallService, link.SendActionGoal)
-_OF_CLIENTS = (*_ASKED, link.ServiceResponse, link.ActionResult)
-"""Messages as large and as many as clients make them."""
+A stop is none: it must not overtake a :class:`link.Resume` sent before it, since that would end the stop.
+"""
+
+_REQUESTS = (link.CallService, link.SendActionGoal)
+_OF_CLIENTS = (*_REQUESTS, link.ServiceResponse, link.ActionResult)
+"""Messages whose size and number clients decide."""
 
 
-class _Whole:
-    """A frame that is not divided."""
+class _WholeFrame:
+    """A frame that is sent whole."""
 
     divided = False
 
@@ -508,17 +597,17 @@ class _Whole:
 
     @property
     def left(self) -> int:
-        """Bytes that were not taken."""
+        """Bytes not sent yet."""
         return len(self._frame)
 
     def take(self, most: int) -> bytes:
-        """All of it."""
+        """The whole frame."""
         frame, self._frame = self._frame, b""
         return frame
 
 
-class _Parts(_Whole):
-    """A frame that is divided where it is a sample or a message (SPEC section 2.1). Commands may go in between."""
+class _FrameParts(_WholeFrame):
+    """A sample or message that is sent in parts (SPEC 2.1), so that commands can go in between."""
 
     def __init__(self, frame: bytes) -> None:
         super().__init__(frame)
@@ -534,11 +623,11 @@ class _Parts(_Whole):
 
     @property
     def left(self) -> int:
-        """Bytes of the message that were not taken."""
+        """Bytes of the message not sent yet."""
         return len(self._body) - self._at if self._body else super().left
 
     def take(self, most: int) -> bytes:
-        """The next part, or all of what is not divided."""
+        """The next part, or a whole frame that is not divided."""
         if not self._body:
             return super().take(most)
         begun, self._at = self._at, min(len(self._body), self._at + most)
@@ -546,12 +635,12 @@ class _Parts(_Whole):
         return encode_part(self._number, self._stamp, len(self._body), begun, piece)
 
 
-def _nowhere(data: bytes) -> None:
-    """Nobody has dialled yet."""
+def _not_connected(data: bytes) -> None:
+    """The writer of the send queue until the connection is made."""
 
 
 def harden(transport: Any) -> None:
-    """Small messages go at once; a dead peer is noticed by the kernel too, where it can."""
+    """Send small messages at once, and let the kernel detect a dead peer where it can."""
     transport.setTcpNoDelay(True)
     transport.setTcpKeepAlive(True)
     while hasattr(transport, "transport") and not hasattr(transport.getHandle(), "setsockopt"):

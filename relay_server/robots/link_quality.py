@@ -1,49 +1,65 @@
-"""How good a link is, told by round trips of pings over it (SPEC section 1.7, Links and people). Time is given."""
+"""The quality of a link, measured by the round trips of its pings (SPEC 1.7). Time is injected."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import statistics
-from collections import deque
+from array import array
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal, TypedDict
 
 WINDOW = 30.0
-"""Seconds over which round trips are told."""
+"""Seconds over which round trips are summarised."""
 
 RECENT = 5.0
-"""Seconds by which the word for the quality goes."""
+"""Seconds that decide the quality."""
 
 LATE = 1.0
-"""A round trip that takes longer, seconds, counts as lost."""
+"""A round trip that takes longer counts as lost, in seconds."""
 
 SILENCE = 3.0
-"""A link on which nothing has come back for so long, seconds, counts as lost itself."""
+"""A link without an answer for longer counts as lost itself, in seconds."""
 
 SPACING = 0.5
-"""Of more frequent round trips one in this time is kept, seconds: who drives is pinged ten times a second."""
+"""One round trip is kept per this many seconds: clients that drive are pinged ten times a second."""
 
 FAIR = 0.1
 BAD = 0.3
-"""Median round trips, seconds, from which on a link is no better than fair, or bad."""
+"""Median round trips from which a link is fair, or bad, in seconds."""
 
 LOSSES = 256
 """Most losses that are counted."""
 
-_WORDS = ("good", "fair", "bad", "lost")
+Quality = Literal["", "good", "fair", "bad", "lost"]
+
+_WORDS: tuple[Quality, ...] = ("good", "fair", "bad", "lost")
+
+
+class LinkQualityInfo(TypedDict):
+    """How good a way is; milliseconds, of the last 30 s.
+
+    :param lost: seconds of these without an answer
+    :param quality: of the last 5 s; empty while it is unknown
+    """
+
+    rtt_ms: float | None
+    p95_ms: float | None
+    jitter_ms: float | None
+    lost: int
+    quality: Quality
 
 
 @dataclass(frozen=True)
 class LinkQuality:
-    """What is known of a link now. Times are seconds, ``None`` when nobody knows yet.
+    """The quality of a link now. Times are seconds, ``None`` before the first round trip.
 
     :param rtt: median round trip
     :param p95: 95th percentile of round trips
     :param jitter: mean difference of a round trip to the one before
-    :param lost: round trips that took longer than :data:`LATE`, or have no answer for so long
-    :param lately: median round trip of the last :data:`RECENT` seconds
+    :param lost: pings answered later than :data:`LATE`, or without an answer for longer
+    :param recent_rtt: median round trip of the last :data:`RECENT` seconds
     :param quality: ``good``, ``fair``, ``bad``, ``lost``; empty before the first round trip
     """
 
@@ -51,11 +67,11 @@ class LinkQuality:
     p95: float | None = None
     jitter: float | None = None
     lost: int = 0
-    lately: float | None = None
-    quality: str = ""
+    recent_rtt: float | None = None
+    quality: Quality = ""
 
-    def told(self) -> dict[str, Any]:
-        """The fields as they are told, in milliseconds."""
+    def summary(self) -> LinkQualityInfo:
+        """The fields that users see, in milliseconds."""
         return {
             "rtt_ms": milliseconds(self.rtt),
             "p95_ms": milliseconds(self.p95),
@@ -70,79 +86,87 @@ NO_LINK = LinkQuality(quality="lost")
 
 
 class LinkQualityMeter:
-    """Keeps the round trips of one link for as long as they are told."""
+    """Keeps the round trips of one link for :data:`WINDOW` seconds."""
 
-    __slots__ = ("_losses", "_trips")
+    __slots__ = ("_losses", "_times", "_trips")
 
     def __init__(self) -> None:
-        self._trips: deque[tuple[float, float]] = deque()
-        self._losses: deque[float] = deque(maxlen=LOSSES)
+        # Every client has a meter, and an empty deque takes 700 bytes.
+        self._times = array("d")
+        self._trips = array("d")
+        self._losses: list[float] = []
 
-    def came_back(self, now: float, trip: float) -> None:
+    def answered(self, now: float, trip: float) -> None:
         """A ping was answered.
 
         :param now: monotonic seconds
         :param trip: seconds since the ping was sent
         """
-        self.passed_over(now, trip)
-        if self._trips and now - self._trips[-1][0] < SPACING and trip <= LATE:
+        self.unanswered(now, trip)
+        if self._times and now - self._times[-1] < SPACING and trip <= LATE:
             return
-        self._trips.append((now, trip))
+        self._times.append(now)
+        self._trips.append(trip)
         self._forget(now)
 
-    def passed_over(self, now: float, age: float) -> None:
-        """A ping was not answered, since a later one was (RFC 6455 section 5.5.3); a loss only if it was late already.
+    def unanswered(self, now: float, age: float) -> None:
+        """A ping was skipped because a later one was answered (RFC 6455 section 5.5.3).
+
+        It is lost only if it was late already.
 
         :param age: seconds since it was sent
         """
         if age > LATE:
             self._losses.append(now)
+            del self._losses[:-LOSSES]
 
-    def reading(self, now: float, out: Collection[float]) -> LinkQuality:
-        """What is known now.
+    def link_quality(self, now: float, out: Collection[float]) -> LinkQuality:
+        """The quality now.
 
-        :param out: seconds since each of the pings was sent that have no answer yet
+        :param out: ages in seconds of the pings that have no answer yet
         """
         self._forget(now)
         late = sum(age > LATE for age in out)
-        trips = [trip for _, trip in self._trips]
+        trips = self._trips.tolist()
         lost = len(self._losses) + late
         silent = max(out, default=0.0) > SILENCE
         if not trips:
             return LinkQuality(lost=lost, quality="lost" if silent else "")
-        lately = statistics.median([trip for at, trip in self._trips if at > now - RECENT] or trips[-1:])
+        recent_rtt = statistics.median(
+            [trip for at, trip in zip(self._times, trips, strict=True) if at > now - RECENT] or trips[-1:]
+        )
         lossy = late > 0 or any(at > now - RECENT for at in self._losses)
         return LinkQuality(
             rtt=statistics.median(trips),
             p95=sorted(trips)[math.ceil(0.95 * len(trips)) - 1],
             jitter=_jitter(trips),
             lost=lost,
-            lately=lately,
-            quality="lost" if silent else _worse(_word(lately), "bad" if lossy else "good"),
+            recent_rtt=recent_rtt,
+            quality="lost" if silent else _worse(_word(recent_rtt), "bad" if lossy else "good"),
         )
 
     def _forget(self, now: float) -> None:
-        while self._trips and self._trips[0][0] < now - WINDOW:
-            self._trips.popleft()
+        while self._times and self._times[0] < now - WINDOW:
+            del self._times[0], self._trips[0]
         while self._losses and self._losses[0] < now - WINDOW:
-            self._losses.popleft()
+            del self._losses[0]
 
 
 def joined(near: LinkQuality, far: LinkQuality) -> LinkQuality:
-    """Two links one after the other: what is sent over both takes the time of both."""
+    """The quality of two links in series: their round trips add up."""
     if "lost" in (near.quality, far.quality):
         return LinkQuality(lost=near.lost + far.lost, quality="lost")
     if not near.quality or not far.quality:
         return LinkQuality(lost=near.lost + far.lost)
-    lately = _sum(near.lately, far.lately)
+    recent_rtt = _sum(near.recent_rtt, far.recent_rtt)
     halves = _worse(near.quality, far.quality)
     return LinkQuality(
         rtt=_sum(near.rtt, far.rtt),
         p95=_sum(near.p95, far.p95),
         jitter=_sum(near.jitter, far.jitter),
         lost=near.lost + far.lost,
-        lately=lately,
-        quality=halves if lately is None else _worse(halves, _word(lately)),
+        recent_rtt=recent_rtt,
+        quality=halves if recent_rtt is None else _worse(halves, _word(recent_rtt)),
     )
 
 
@@ -151,13 +175,13 @@ def milliseconds(seconds: float | None) -> float | None:
     return None if seconds is None else round(seconds * 1000, 2)
 
 
-def _word(rtt: float) -> str:
+def _word(rtt: float) -> Quality:
     if rtt < FAIR:
         return "good"
     return "fair" if rtt < BAD else "bad"
 
 
-def _worse(one: str, other: str) -> str:
+def _worse(one: Quality, other: Quality) -> Quality:
     return max(one, other, key=_WORDS.index)
 
 

@@ -1,4 +1,4 @@
-"""Tickets of one use, with which a robot's new link says what it was asked to come for."""
+"""Tickets for one use. A robot's new link presents one to join the channel or stream it was dialled for."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Tickets(Generic[T]):
-    """Who or what each ticket is for; of one and the same only the latest ticket is good.
+    """Open tickets with their owners. Only the latest ticket of an owner is valid.
 
     :param new_ticket: makes an unguessable text
     """
@@ -23,11 +23,11 @@ class Tickets(Generic[T]):
         self._issued: dict[str, tuple[T, float]] = {}
 
     def __len__(self) -> int:
-        """How many are kept."""
+        """The number of open tickets."""
         return len(self._issued)
 
     def issue(self, owner: T) -> str:
-        """A new ticket, good for :data:`~relay_protocol.limits.CHANNEL_TICKET_SECONDS`."""
+        """A new ticket, valid for :data:`~relay_protocol.limits.CHANNEL_TICKET_SECONDS`."""
         now = self._clock.seconds()
         self._issued = {
             ticket: (held, until)
@@ -39,10 +39,10 @@ class Tickets(Generic[T]):
         return ticket
 
     def redeem(self, ticket: str) -> T | None:
-        """What the ticket is for, and the ticket is spent; ``None`` when it is unknown, used or too old."""
+        """Spend a ticket. Returns its owner, or ``None`` if it is unknown, used or expired."""
         found = self._issued.pop(ticket, None)
         return None if found is None or found[1] < self._clock.seconds() else found[0]
 
     def withdraw(self, owner: T) -> None:
-        """What was issued for it is not good any more."""
+        """Invalidate the tickets of an owner."""
         self._issued = {ticket: held for ticket, held in self._issued.items() if held[0] is not owner}

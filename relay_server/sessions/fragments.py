@@ -1,4 +1,4 @@
-"""Messages that a client sends in fragments (rosbridge v2 protocol, section 3.1.1; SPEC section 1.6)."""
+"""Messages that a client sends in fragments (rosbridge v2 protocol, section 3.1.1; SPEC 1.6)."""
 
 from __future__ import annotations
 
@@ -9,61 +9,60 @@ from relay_protocol.errors import Invalid, Refused
 from relay_server.common.clock import Clock, Timer, cancel
 
 PARTS = 16_384
-"""Fragments of one message, and of all that are unfinished: each takes memory beside its bytes."""
+"""Most fragments of one message, and of all incomplete messages of a client; each takes memory beside its bytes."""
 
 
-class _Unfinished:
-    """A message of which something has come."""
+class _Incomplete:
+    """A message of which some fragments have come."""
 
-    __slots__ = ("bytes", "parts", "since", "total", "touched")
+    __slots__ = ("bytes", "earliest_sent", "parts", "total", "touched")
 
-    def __init__(self, total: int, since: int) -> None:
+    def __init__(self, total: int, earliest_sent: int) -> None:
         self.total = total
-        self.since = since
+        self.earliest_sent = earliest_sent
         self.parts: dict[int, bytes] = {}
         self.bytes = 0
         self.touched = 0.0
 
 
 class FragmentAssembler:
-    """The unfinished messages of one client. What they take is what has come of them, whatever they announce.
+    """Joins the fragments of one client's messages. Memory is used for what has come, not for what is announced.
 
-    :param not_before: the moment before which what comes now can't have been sent, see
-        :class:`relay_server.sessions.message_age.MessageAge`
-    :param finished: takes the text of a message that is whole, and that moment for its first fragment: a
+    :param earliest_sent: of a message that comes now; see :class:`relay_server.sessions.message_age.MessageAge`
+    :param on_complete: called with the text of a whole message, and ``earliest_sent`` of its first fragment, as a
         command is as old as its beginning
-    :param most: bytes that may have come of all of them
-    :param given_up: takes the words about one that is not, and its id
+    :param most: most bytes of all incomplete messages together
+    :param on_expire: called with an error text and the id of a message whose fragments stopped coming
     """
 
-    # Every client has one of these, and hardly any uses it.
+    # Every client has one, and few use it.
     __slots__ = (
         "_bytes",
         "_clock",
         "_dropped",
-        "_finished",
-        "_given_up",
+        "_earliest_sent",
+        "_incomplete",
         "_most",
-        "_not_before",
+        "_on_complete",
+        "_on_expire",
         "_parts",
         "_timer",
-        "_unfinished",
     )
 
     def __init__(
         self,
         clock: Clock,
-        not_before: Callable[[], int],
-        finished: Callable[[bytes, int], None],
-        given_up: Callable[[str, rosbridge.Id], None],
+        earliest_sent: Callable[[], int],
+        on_complete: Callable[[bytes, int], None],
+        on_expire: Callable[[str, rosbridge.Id], None],
         most: int = limits.CLIENT_MESSAGE,
     ) -> None:
         self._clock = clock
-        self._not_before = not_before
-        self._finished = finished
-        self._given_up = given_up
+        self._earliest_sent = earliest_sent
+        self._on_complete = on_complete
+        self._on_expire = on_expire
         self._most = most
-        self._unfinished: dict[str | int, _Unfinished] = {}
+        self._incomplete: dict[str | int, _Incomplete] = {}
         self._dropped: dict[str | int, None] = {}
         self._parts = 0
         self._bytes = 0
@@ -71,22 +70,22 @@ class FragmentAssembler:
 
     def end(self) -> None:
         """The client is gone."""
-        self._unfinished.clear()
+        self._incomplete.clear()
         cancel(self._timer)
         self._timer = None
 
-    def take(self, part: rosbridge.Fragment) -> None:
-        """One more fragment.
+    def add(self, part: rosbridge.Fragment) -> None:
+        """Add a fragment; after an error all of its message is dropped.
 
-        :raises Invalid: it does not fit what came before; all of its message is let go
-        :raises Refused: too much is unfinished; all of its message is let go
+        :raises Invalid: it does not fit the fragments before
+        :raises Refused: the client has too many, or too large, incomplete messages
         """
-        if isinstance(part.id, str) and len(part.id) > limits.LABEL:
-            raise Invalid(f"'id' of a fragment may have {limits.LABEL} characters")
+        if isinstance(part.id, str) and len(part.id) > limits.LABEL_LENGTH:
+            raise Invalid(f"'id' of a fragment may have {limits.LABEL_LENGTH} characters")
         if part.num == 0:
             self._dropped.pop(part.id, None)
         elif part.id in self._dropped:
-            # The rest of a message that was refused already.
+            # It belongs to a message that was dropped already.
             return
         try:
             message = self._add(part, part.data.encode())
@@ -95,15 +94,17 @@ class FragmentAssembler:
             raise
         if len(message.parts) == message.total:
             self._remove(part.id)
-            self._finished(b"".join(message.parts[number] for number in range(message.total)), message.since)
+            self._on_complete(
+                b"".join(message.parts[number] for number in range(message.total)), message.earliest_sent
+            )
 
-    def _add(self, part: rosbridge.Fragment, data: bytes) -> _Unfinished:
+    def _add(self, part: rosbridge.Fragment, data: bytes) -> _Incomplete:
         _check(part)
-        message = self._unfinished.get(part.id)
+        message = self._incomplete.get(part.id)
         if message is None:
-            if len(self._unfinished) >= limits.FRAGMENTS:
-                raise Refused(f"{limits.FRAGMENTS} messages in fragments are unfinished already")
-            message = self._unfinished[part.id] = _Unfinished(part.total, self._not_before())
+            if len(self._incomplete) >= limits.INCOMPLETE_MESSAGES:
+                raise Refused(f"{limits.INCOMPLETE_MESSAGES} messages in fragments are unfinished already")
+            message = self._incomplete[part.id] = _Incomplete(part.total, self._earliest_sent())
         if part.total != message.total:
             raise Invalid(f"'total' was {message.total} before and is {part.total} now")
         if part.num in message.parts:
@@ -118,11 +119,11 @@ class FragmentAssembler:
         self._parts += 1
         self._bytes += len(data)
         if self._timer is None:
-            self._timer = self._clock.callLater(limits.FRAGMENT_SECONDS, self._look)
+            self._timer = self._clock.callLater(limits.FRAGMENT_SECONDS, self._expire)
         return message
 
-    def _remove(self, id: str | int) -> _Unfinished | None:
-        message = self._unfinished.pop(id, None)
+    def _remove(self, id: str | int) -> _Incomplete | None:
+        message = self._incomplete.pop(id, None)
         if message is not None:
             self._parts -= len(message.parts)
             self._bytes -= message.bytes
@@ -131,24 +132,24 @@ class FragmentAssembler:
     def _drop(self, id: str | int) -> None:
         self._remove(id)
         self._dropped[id] = None
-        if len(self._dropped) > limits.FRAGMENTS:
+        if len(self._dropped) > limits.INCOMPLETE_MESSAGES:
             self._dropped.pop(next(iter(self._dropped)))
 
-    def _look(self) -> None:
-        """Give up what has not gone on for too long."""
+    def _expire(self) -> None:
+        """Drop messages of which no fragment has come for :data:`relay_protocol.limits.FRAGMENT_SECONDS`."""
         self._timer = None
         oldest = self._clock.seconds() - limits.FRAGMENT_SECONDS
-        for id in [id for id, each in self._unfinished.items() if each.touched <= oldest]:
+        for id in [id for id, each in self._incomplete.items() if each.touched <= oldest]:
             message = self._remove(id)
             assert message is not None
-            self._given_up(
-                f"a message in fragments is given up: {len(message.parts)} of {message.total} came, "
-                f"and then nothing for {limits.FRAGMENT_SECONDS:g} s",
+            self._on_expire(
+                f"a message in fragments is dropped: {len(message.parts)} of {message.total} came, "
+                f"and then none for {limits.FRAGMENT_SECONDS:g} s",
                 id,
             )
-        if self._unfinished:
-            next_at = min(each.touched for each in self._unfinished.values()) + limits.FRAGMENT_SECONDS
-            self._timer = self._clock.callLater(max(0.0, next_at - self._clock.seconds()), self._look)
+        if self._incomplete:
+            next_at = min(each.touched for each in self._incomplete.values()) + limits.FRAGMENT_SECONDS
+            self._timer = self._clock.callLater(max(0.0, next_at - self._clock.seconds()), self._expire)
 
 
 def _check(part: rosbridge.Fragment) -> None:

@@ -1,8 +1,6 @@
-"""Goals a client sends to actions on the robot: each ends in exactly one ``action_result``."""
+"""Goals that a client sends to actions: each ends in exactly one ``action_result``."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 from twisted.internet.defer import Deferred
 
@@ -10,89 +8,79 @@ from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Invalid, Refused
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
-from relay_server.channels.encodings import MessageEncoding, asked
+from relay_server.channels.encodings import requested_encoding
 from relay_server.channels.goals import ClientGoal, GoalStatusCode
-from relay_server.channels.robot_link import RequestContext, resolve
-from relay_server.sessions.motion import MotionRequest
-from relay_server.sessions.service_calls import untold
-from relay_server.sessions.type_names import normal_type
-
-if TYPE_CHECKING:
-    from relay_server.sessions.session import Session
+from relay_server.channels.members import RequestContext
+from relay_server.channels.names import normal_type, resolve
+from relay_server.sessions.context import ClientContext
+from relay_server.sessions.motion_requests import MotionRequest
 
 GOALS = 64
-"""Goals of one connection that may be under way."""
+"""Most goals of one connection that have not ended."""
 
 GOAL_BYTES = 2 * MIB
-"""Arguments of goals under way, over all of them."""
+"""Most bytes of the arguments of all goals of one connection that have not ended."""
 
 
 class _Goal:
-    """One goal of the client, as the channel tells of it.
+    """A goal of the client (:class:`relay_server.channels.goals.GoalRequester`).
 
     :param moves: whether the robot counts it as motion
     """
 
-    def __init__(
-        self, desk: ActionGoalHandler, ask: rosbridge.SendActionGoal, form: MessageEncoding, moves: bool
-    ) -> None:
-        self.ask = ask
+    def __init__(self, handler: ActionGoalHandler, operation: rosbridge.SendActionGoal, moves: bool) -> None:
+        self.operation = operation
         self.moves = moves
-        self.form = form
-        self.size = len(bytes(ask.args or b""))
-        self.pursued: ClientGoal | None = None
-        self._desk = desk
+        self.size = len(bytes(operation.args or b""))
+        self.record: ClientGoal | None = None
+        self._handler = handler
 
     def feedback(self, values: bytes) -> None:
-        """How far it has come."""
-        self._desk.tell_feedback(self, values)
+        """Feedback has come."""
+        self._handler.send_feedback(self, values)
 
-    def unreadable(self, words: str) -> None:
-        """Something of it can't be told."""
-        self._desk.tell_trouble(self, words)
+    def warn(self, reason: str) -> None:
+        """Feedback can't be converted."""
+        self._handler.warn(self, reason)
 
     def ended(self, status: int, result: bool, values: bytes) -> None:
-        """It is over."""
-        self._desk.goal_ended(self, status, result, values)
+        """The goal has ended."""
+        self._handler.end_goal(self, status, result, values)
 
 
 class ActionGoalHandler:
     """The goals of one session."""
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, client: ClientContext) -> None:
+        self._client = client
         self._goals: list[_Goal] = []
 
-    @property
-    def moving(self) -> bool:
-        """Whether a goal that moves the robot is under way."""
-        return any(goal.moves for goal in self._goals)
-
-    def send_goal(self, ask: rosbridge.SendActionGoal) -> None:
-        """Have a goal pursued."""
-        session, action = self._session, resolve(ask.action)
-        session.judge(Operation.CALL, action)
-        moves = session.robot.description.motion.moves_by_action(action)
-        stamp = session.not_before
-        movement = MotionRequest(session, f"a goal for {action}", stamp) if moves else None
-        type_name = normal_type(ask.action_type, "action")
-        self._check_room(ask)
-        goal = _Goal(self, ask, asked(ask, session.tell), moves)
+    def send_goal(self, operation: rosbridge.SendActionGoal) -> None:
+        """Send a goal to the robot, or to the client that offers the action."""
+        client, action = self._client, resolve(operation.action)
+        client.require(Operation.CALL, action)
+        moves = client.robot.description.motion.moves_by_action(action)
+        earliest_sent = client.earliest_sent
+        motion_request = MotionRequest(client, f"a goal for {action}", earliest_sent) if moves else None
+        type_name = normal_type(operation.action_type, "action")
+        self._check_room(operation)
+        requested_encoding(operation, client.notify)
+        goal = _Goal(self, operation, moves)
         self._goals.append(goal)
-        session.notice("goal.begun", action=action, goal=ask.id)
-        pursued = session.channel.asking.pursue(
-            session,
+        client.motion.goals += moves
+        client.activity("goal.begun", action=action, goal=operation.id)
+        goal.record = client.channel.requests.send_goal(
+            client,
             goal,
             action,
             type_name,
-            bytes(ask.args or b""),
-            RequestContext(session.number, stamp, movement),
-            feedback=ask.feedback,
+            bytes(operation.args or b""),
+            RequestContext(client.number, earliest_sent, motion_request),
+            feedback=operation.feedback,
         )
-        goal.pursued = pursued
 
-    def beginning(self, id: rosbridge.Id) -> Deferred[None]:
-        """Fires when a goal has been handed on to who is to pursue it, or is over."""
+    def begun(self, id: rosbridge.Id) -> Deferred[None]:
+        """Fires when a goal was sent to the robot or client that executes it, or has ended."""
         waiting: Deferred[None] = Deferred()
 
         def done(result: object) -> object:
@@ -101,72 +89,62 @@ class ActionGoalHandler:
             return result
 
         for goal in self._goals:
-            if goal.ask.id == id and goal.pursued is not None and goal.pursued.beginning is not None:
-                goal.pursued.beginning.addBoth(done)
+            if goal.operation.id == id and goal.record is not None and goal.record.starting is not None:
+                goal.record.starting.addBoth(done)
                 return waiting
         done(None)
         return waiting
 
-    def cancel(self, ask: rosbridge.CancelActionGoal) -> None:
-        """The client wants a goal no more; its result still comes."""
-        if ask.id is None:
+    def cancel(self, operation: rosbridge.CancelActionGoal) -> None:
+        """Cancel a goal; its result still comes."""
+        if operation.id is None:
             raise Invalid("'cancel_action_goal' needs the 'id' of the goal")
         for goal in self._goals:
-            if goal.ask.id == ask.id and goal.pursued is not None:
-                goal.pursued.cancel()
+            if goal.operation.id == operation.id and goal.record is not None:
+                goal.record.cancel()
                 return
-        raise Invalid(f"no goal of yours with the id '{str(ask.id)[:80]}' is under way")
+        raise Invalid(f"no goal of yours with the id '{str(operation.id)[:80]}' is under way")
 
     def rights_changed(self) -> None:
-        """What the client may not pursue any more is cancelled, and it is told so at once."""
+        """Cancel goals for which the client has no right any more; they end at once."""
         for goal in list(self._goals):
-            verdict = self._session.permit.judge(Operation.CALL, resolve(goal.ask.action))
-            if not verdict.allowed and goal.pursued is not None:
-                goal.pursued.abandon()
-                self.goal_ended(goal, GoalStatusCode.CANCELED, False, jsontext.encode(verdict.reason))
+            decision = self._client.permit.decide(Operation.CALL, resolve(goal.operation.action))
+            if not decision.allowed and goal.record is not None:
+                goal.record.abandon()
+                self.end_goal(goal, GoalStatusCode.CANCELED, False, jsontext.encode(decision.reason))
 
-    def answer(
-        self,
-        ask: rosbridge.SendActionGoal,
-        status: int,
-        result: bool,
-        values: bytes,
-        form: MessageEncoding | None = None,
-    ) -> None:
-        """Tell the client that one of its goals is over, in the form it asked for."""
-        message = rosbridge.action_result(ask.action, ask.id, status, result, values)
-        self._session.say(message, asked(ask, untold) if form is None else form)
+    def warn(self, goal: _Goal, reason: str) -> None:
+        """Notify the client that feedback can't be converted."""
+        self._client.notify("warning", reason, goal.operation.id)
 
-    def tell_trouble(self, goal: _Goal, words: str) -> None:
-        """Something of a goal can't be told to the client."""
-        self._session.tell("warning", words, goal.ask.id)
+    def send_feedback(self, goal: _Goal, values: bytes) -> None:
+        """Send feedback."""
+        self._client.port.action_feedback(goal, goal.operation, values)
 
-    def tell_feedback(self, goal: _Goal, values: bytes) -> None:
-        """Tell how far a goal has come. To a client that reads slowly, the newest counts."""
-        message = rosbridge.action_feedback(goal.ask.action, goal.ask.id, values)
-        self._session.outbox.data(goal, self._session.framed(message, goal.form), 1)
-
-    def goal_ended(self, goal: _Goal, status: int, result: bool, values: bytes) -> None:
-        """Take a goal off the list. Feedback that still waits would come behind the result; it is let go."""
+    def end_goal(self, goal: _Goal, status: int, result: bool, values: bytes) -> None:
+        """Answer a goal. Queued feedback is dropped, as it would come after the result."""
         self._goals.remove(goal)
+        self._client.motion.goals -= goal.moves
         self._notice_end(goal, status)
-        self._session.outbox.forget(goal)
+        self._client.port.forget(goal)
         if status == GoalStatusCode.NEVER_BEGAN:
-            self._session.tell("error", str(jsontext.decode_any(values)), goal.ask.id)
-        self.answer(goal.ask, status, result, values, goal.form)
+            self._client.notify("error", str(jsontext.decode_any(values)), goal.operation.id)
+        self._client.port.action_result(goal.operation, status, result, values)
 
     def end(self) -> None:
-        """Nobody is left to hear of goals; the channel has them cancelled."""
+        """The client is gone; the channel cancels its goals."""
         for goal in self._goals:
             self._notice_end(goal, GoalStatusCode.CANCELED)
 
     def _notice_end(self, goal: _Goal, status: int) -> None:
-        self._session.notice("goal.ended", action=resolve(goal.ask.action), goal=goal.ask.id, status=status)
+        self._client.activity(
+            "goal.ended", action=resolve(goal.operation.action), goal=goal.operation.id, status=status
+        )
 
-    def _check_room(self, ask: rosbridge.SendActionGoal) -> None:
-        if ask.id is not None and any(goal.ask.id == ask.id for goal in self._goals):
-            raise Refused(f"a goal of yours with the id '{str(ask.id)[:80]}' is under way already")
+    def _check_room(self, operation: rosbridge.SendActionGoal) -> None:
+        if operation.id is not None and any(goal.operation.id == operation.id for goal in self._goals):
+            raise Refused(f"a goal of yours with the id '{str(operation.id)[:80]}' is under way already")
         if len(self._goals) >= GOALS:
             raise Refused(f"{GOALS} goals of this connection are under way already")
-        if sum(goal.size for goal in self._goals) + len(bytes(ask.args or b"")) > GOAL_BYTES:
+        if sum(goal.size for goal in self._goals) + len(bytes(operation.args or b"")) > GOAL_BYTES:
             raise Refused("the arguments of the goals under way are too large together; wait for results")

@@ -1,10 +1,11 @@
-"""What edges ask for, put together from who it is, what it may, and who is there."""
+"""Opens sessions of clients that are authenticated: authorizes them, and keeps the list of all that are open."""
 
 from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,53 +15,44 @@ from relay_protocol import link
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.access import NO_ROBOT, Access, Permit, Principal
-from relay_server.auth import passwords
-from relay_server.auth.authenticator import (
-    NAMED,
-    Authenticator,
-    TicketPurpose,
-    TooManyTries,
-    named_realm,
-    session_token,
-)
-from relay_server.auth.origins import Origins
-from relay_server.channels.channels import Channels
+from relay_server.channels.channel import Channels
 from relay_server.common import close_codes
-from relay_server.common.clock import Clock, with_timeout
+from relay_server.common.clock import Clock, PeriodicTimers
 from relay_server.common.connection_ids import ConnectionIds
 from relay_server.common.cpu_quota import UserQuotas
 from relay_server.common.database import AsyncDatabase
-from relay_server.common.timers import PeriodicTimers
-from relay_server.control.controllers import Controllers
+from relay_server.control.service import ControlService
 from relay_server.events.bus import EventBus
+from relay_server.foxglove.assets import asset_budget
+from relay_server.foxglove.options import StreamOptions
+from relay_server.foxglove.port import FoxglovePort
+from relay_server.modules.service import ModuleService
 from relay_server.relay_node.node import RelayNode
 from relay_server.robots.registry import RobotRegistry, RobotState
+from relay_server.sessions.context import ClientContext
 from relay_server.sessions.message_age import MessageAge
-from relay_server.sessions.ports import ClientTransport, Timing
-from relay_server.sessions.presence import PresenceService
+from relay_server.sessions.ports import ClientPort, ClientTransport, Timing
+from relay_server.sessions.presence import PresenceService, RobotInfo
+from relay_server.sessions.rosbridge_port import RosbridgePort
 from relay_server.sessions.session import Session
 from relay_server.sessions.summaries import RobotSummaries
+from relay_server.sessions.websocket_port import WebsocketContext
 from relay_server.video.streams import CameraStreams
-from relay_server.video.viewer import CameraViewer, FrameSink, check_view, view
-
-LOOKUP_SECONDS = 3.0
-"""The database has so long to say that somebody may stop a robot."""
-
-NOT_LOOKED_UP = (
-    f"the database has not answered within {LOOKUP_SECONDS:g} s, and without it the relay can't say who may do what to "
-    "which robots. Stop those that move by their own switch, or by 'switchboard stop' on the relay's machine"
-)
+from relay_server.video.viewer import CameraViewer, FrameSink, camera_info, check_view
 
 
 class ShuttingDown(Unavailable):
-    """The relay ends, and with it what is open."""
+    """The relay is shutting down."""
 
     code = "going_down"
 
 
 @dataclass(frozen=True)
-class AuthorizedSession:
-    """Somebody who may come in to a robot; ``snapshot``: for one picture."""
+class Admission:
+    """A principal that may open a session on a robot.
+
+    :param snapshot: for one image of a camera
+    """
 
     permit: Permit
     robot: RobotState
@@ -69,9 +61,8 @@ class AuthorizedSession:
 
 
 class SessionManager:
-    """Serves the HTTP API and the websockets; keeps the open sessions.
+    """Opens the sessions of websockets and of HTTP clients, and closes them all at shutdown.
 
-    :param cookie: name of the session cookie
     :param clock_ns: monotonic nanoseconds
     :param wall: Unix time in seconds
     """
@@ -80,197 +71,155 @@ class SessionManager:
         self,
         clock: Clock,
         store: AsyncDatabase,
-        authenticator: Authenticator,
         access: Access,
         registry: RobotRegistry,
         channels: Channels,
         videos: CameraStreams,
-        desks: Controllers,
-        journal: EventBus,
-        origins: Origins,
+        control: ControlService,
+        modules: ModuleService,
+        bus: EventBus,
         timing: Timing,
         *,
-        cookie: str,
         clock_ns: Callable[[], int],
         wall: Callable[[], float],
     ) -> None:
         self.accepting = True
         self._clock = clock
         self._store = store
-        self._auth = authenticator
         self._access = access
         self._registry = registry
         self._channels = channels
         self._videos = videos
-        self._desks = desks
-        self._journal = journal
-        self._origins = origins
+        self._controllers = control.controllers
+        self._bus = bus
         self.timing = timing
-        self._rounds = PeriodicTimers(clock)
-        self._budgets = UserQuotas(clock.seconds, time.thread_time)
-        self._cookie = cookie
+        self._timers = PeriodicTimers(clock)
+        self._quotas = UserQuotas(clock.seconds, time.thread_time)
+        self._asset_budget = asset_budget()
         self._clock_ns = clock_ns
         self._wall = wall
-        # By them robots know who has to let go. They must not take a client for one of a relay that ran before.
+        # Robots know by these numbers which client must release the controls. They are new in each run of the relay.
         self._numbers = ConnectionIds()
-        self._sessions: dict[int, dict[int, Session]] = {}
-        self._watchings: set[CameraViewer] = set()
-        people = PresenceService(self.sessions_of, desks.holder, clock.seconds)
-        self.overview = RobotSummaries(access, registry, people, self.sessions_of, desks, clock.seconds)
-        self._local = RelayNode(self.sessions_of, videos, people)
+        self._run_id = secrets.token_hex(8)
+        self._clients: dict[int, dict[int, ClientContext]] = {}
+        self._viewers: set[CameraViewer] = set()
+        people = PresenceService(self.clients_of, control.controllers.holder, clock.seconds)
+        self.overview = RobotSummaries(
+            access, registry, people, self.clients_of, control.controllers, clock.seconds
+        )
+        self.relay_node = RelayNode(self.clients_of, videos, people, control, modules)
 
-    def __iter__(self) -> Iterator[Session]:
-        return iter([session for each in self._sessions.values() for session in each.values()])
+    def __iter__(self) -> Iterator[ClientContext]:
+        return iter([client for each in self._clients.values() for client in each.values()])
 
-    def sessions_of(self, robot_id: int) -> list[Session]:
-        """The open sessions on a robot, oldest first."""
-        return list(self._sessions.get(robot_id, {}).values())
+    def clients_of(self, robot_id: int) -> list[ClientContext]:
+        """The clients of a robot, oldest first."""
+        return list(self._clients.get(robot_id, {}).values())
 
-    # --- who is it ----------------------------------------------------------------------------------------
-
-    async def password(self, user: str, password: str, address: str) -> tuple[Principal, str]:
-        """Log in by password; a principal and the token of a new portal session."""
-        try:
-            login = await self._auth.password(user, password, address)
-        except SwitchboardError as error:
-            # Who is over the limit was recorded while under it; a flood must not reach the database.
-            if not isinstance(error, TooManyTries):
-                self._journal.event(
-                    "login.refused",
-                    "relay",
-                    cause=address,
-                    user=user[:NAMED],
-                    realm=named_realm(user),
-                    address=address,
-                    reason=error.code,
-                )
-            raise
-        return login, await self._auth.open_session(login, address, "password")
-
-    async def login_code(self, code: str, address: str) -> tuple[Principal, str]:
-        """Log in by a one-time link."""
-        login = await self._auth.login_code(code, address)
-        return login, await self._auth.open_session(login, address, "link")
-
-    async def logout(self, principal: Principal) -> None:
-        """End the session the principal came with, and what was opened with it."""
-        await self._store.write(queries.revoke_token, principal.token_id)
-        await self._access.refresh()
-
-    async def token(self, token: str) -> Principal:
-        """The principal of an access token or session."""
-        token_hash = passwords.token_hash(token)
-        known = self._access.proves(token_hash)
-        if known is not None:
-            return known
-        seen = self._access.refreshed
-        principal = await self._auth.token(token)
-        self._access.remember(token_hash, principal, seen)
-        return principal
-
-    bearer = token
-
-    async def urgent_token(self, token: str) -> Principal:
-        """The same for who stops robots: one that was proved before need not wait for the database.
-
-        :raises Unavailable: the database has to be asked, and does not answer soon
-        """
-        known = self._access.remembered(passwords.token_hash(token))
-        if known is not None:
-            return known
-        return await with_timeout(self._clock, LOOKUP_SECONDS, self.token(token), NOT_LOOKED_UP)
-
-    async def ticket(self, ticket: str, asked: TicketPurpose, *, spend: bool = True) -> Principal:
-        """The principal of a single-use ticket."""
-        return await self._auth.ticket(ticket, asked, spend=spend)
-
-    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
-        """The principal of a session cookie in a websocket's handshake.
-
-        :raises Refused: a cookie without a listed Origin
-        """
-        token = session_token(self._origins, self._cookie, header, origin, host)
-        return None if token is None else await self._auth.token(token)
+    def tokens_of(self, robot_id: int) -> list[int]:
+        """The numbers of the tokens by which a robot's clients are connected, one of each client."""
+        return [client.permit.principal.token_id for client in self._clients.get(robot_id, {}).values()]
 
     # --- robots -------------------------------------------------------------------------------------------
 
-    async def admit(self, principal: Principal, robot: str, address: str) -> AuthorizedSession:
-        """Let a principal in to a robot it has a right on; :meth:`open` or :meth:`turn_away` must follow.
+    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
+        """Authorize a principal for a robot on which it has any right; :meth:`open` or :meth:`release` must follow.
 
-        :raises NotFound: no such robot, or no right on it: one and the same answer
+        :raises NotFound: no such robot, or no right on it; the answers are the same
         """
         found = await self._access.permit_by_name(principal, robot)
         if found is None:
-            self._journal.event(
+            self._bus.publish(
                 "client.refused",
-                "relay",
-                cause=f"user:{principal.full}",
-                user_id=principal.user_id,
+                source=f"user:{principal.name}",
+                realm=principal.realm,
                 robot=robot[:64],
                 address=address,
             )
             raise NotFound(NO_ROBOT)
         record, permit = found
-        return AuthorizedSession(
-            permit, self._registry.presence(record.id, record.name, record.realm), address
-        )
+        return Admission(permit, self._registry.robot(record.id, record.name, record.realm), address)
 
-    def turn_away(self, admission: AuthorizedSession) -> None:
-        """Somebody who was admitted left before a session began."""
+    @asynccontextmanager
+    async def admitted(self, principal: Principal, robot: str, address: str) -> AsyncIterator[Admission]:
+        """The admission of a principal for one request; see :meth:`admit`."""
+        admission = await self.admit(principal, robot, address)
+        try:
+            yield admission
+        finally:
+            self.release(admission)
+
+    def release(self, admission: Admission) -> None:
+        """The client left before its authorized session began."""
         self._access.release(admission.permit)
 
-    def open(self, admission: AuthorizedSession, transport: ClientTransport, opened_ns: int) -> Session:
-        """Begin a session that was admitted.
+    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> RosbridgePort:
+        """Begin an authorized session for a client that speaks rosbridge.
 
         :param opened_ns: when the websocket's handshake was answered, monotonic nanoseconds
         """
-        robot = admission.robot
-        session = Session(
-            self._clock,
-            transport,
-            admission.permit,
-            robot,
-            self._channels.of(robot),
-            self._desks.of(robot),
-            self._local,
-            MessageAge(self._clock_ns, opened_ns, lambda: secrets.token_bytes(8)),
-            self.timing,
-            self._rounds,
-            self._budgets.of(admission.permit.principal.user_id),
+        age = MessageAge(self._clock_ns, opened_ns, _ping_token)
+        port = RosbridgePort(self._websocket_context(transport, age))
+        port.attach(self._open(admission, port, age))
+        return port
+
+    def open_foxglove(
+        self, admission: Admission, transport: ClientTransport, opened_ns: int, options: StreamOptions
+    ) -> FoxglovePort:
+        """As :meth:`open`, for a client that speaks the Foxglove protocol.
+
+        :param options: of the URL
+        """
+        age = MessageAge(self._clock_ns, opened_ns, _ping_token)
+        port = FoxglovePort(
+            self._websocket_context(transport, age), self._run_id, options, self._asset_budget
+        )
+        port.attach(self._open(admission, port, age))
+        return port
+
+    def _websocket_context(self, transport: ClientTransport, age: MessageAge) -> WebsocketContext:
+        return WebsocketContext(self._clock, transport, age, self.timing, self._timers)
+
+    def open_in_process(self, admission: Admission, port: ClientPort) -> Session:
+        """Begin an authorized session for a client in this process; it is never pinged."""
+        now = self._clock_ns()
+        return self._open(admission, port, MessageAge(self._clock_ns, now, lambda: b""))
+
+    def _open(self, admission: Admission, port: ClientPort, age: MessageAge) -> Session:
+        robot, permit = admission.robot, admission.permit
+        client = ClientContext(
+            clock=self._clock,
             number=self._numbers.take(),
             address=admission.address,
             since=self._wall(),
-            ended=self._ended,
+            permit=permit,
+            robot=robot,
+            channel=self._channels.of(robot),
+            controller=self._controllers.of(robot),
+            port=port,
+            age=age,
+            user_quota=self._quotas.of(permit.principal.user_id),
         )
-        self._sessions.setdefault(robot.robot_id, {})[session.number] = session
-        robot.users = len(self._sessions[robot.robot_id])
-        principal = admission.permit.principal
-        session.notice = partial(self._journal.tell, robot_id=robot.robot_id, source=f"user:{session.name}")
-        self._journal.event(
-            "client.joined",
-            f"user:{session.name}",
-            cause=f"user:{principal.full}",
-            robot_id=robot.robot_id,
-            user_id=principal.user_id,
-            address=admission.address,
-        )
+        session = Session(client, self._clock, self.relay_node, self._timers, self._ended)
+        self._clients.setdefault(robot.robot_id, {})[client.number] = client
+        robot.users = len(self._clients[robot.robot_id])
+        source = f"user:{client.name}"
+        client.activity = partial(self._bus.publish, robot_id=robot.robot_id, source=source)
+        self._bus.publish("client.joined", robot.robot_id, source, address=admission.address)
         self._registry.changed()
         return session
 
-    def _ended(self, session: Session) -> None:
-        self._access.release(session.permit)
-        open_here = self._sessions.get(session.robot.robot_id, {})
-        open_here.pop(session.number, None)
-        session.robot.users = len(open_here)
-        principal = session.permit.principal
-        self._journal.event(
+    def _ended(self, client: ClientContext) -> None:
+        self._access.release(client.permit)
+        here = self._clients.get(client.robot.robot_id, {})
+        here.pop(client.number, None)
+        client.robot.users = len(here)
+        self._bus.publish(
             "client.left",
-            f"user:{session.name}",
-            cause=f"user:{principal.full}",
-            robot_id=session.robot.robot_id,
-            user_id=principal.user_id,
-            drops=session.outbox.dropped,
-            refusals=session.refusals,
+            client.robot.robot_id,
+            f"user:{client.name}",
+            drops=client.drops,
+            refusals=client.refusals,
         )
         self._registry.changed()
 
@@ -283,106 +232,87 @@ class SessionManager:
         """
         for record, rules in await self._access.robots(principal):
             if record.name == robot:
-                there = self._registry.presence(record.id, record.name, record.realm)
-                streams = self._videos.of(there)
+                there = self._registry.robot(record.id, record.name, record.realm)
+                streams = self._videos.streams_of(there)
                 return [
-                    view(camera, streams)
+                    camera_info(camera, streams)
                     for camera in there.cameras
-                    if rules.judge(Operation.VIEW, camera.name).allowed
+                    if rules.decide(Operation.VIEW, camera.name).allowed
                 ]
         raise NotFound(NO_ROBOT)
 
     async def may_view(
         self, principal: Principal, robot: str, camera: str, transport: str, address: str
     ) -> None:
-        """Whether the principal may view this camera now.
+        """Check that the principal may view a camera now.
 
-        :raises NotFound: no such robot, or no right on it or to view this
+        :raises NotFound: no such robot, or no right on it or to view the camera
         """
         admission = await self.admit(principal, robot, address)
         try:
             check_view(admission.permit, camera, transport)
         finally:
-            self.turn_away(admission)
+            self.release(admission)
 
-    async def viewing(
+    async def view(
         self,
         principal: Principal,
         robot: str,
         camera: str,
         settings: link.VideoSettings,
-        screen: FrameSink,
+        sink: FrameSink,
         address: str,
         snapshot: bool = False,
     ) -> CameraViewer:
-        """Have a camera shown, until :meth:`CameraViewer.leave` or until the screen is told that it has ended.
+        """View a camera until :meth:`CameraViewer.leave`, or until the sink is notified of the end.
 
-        :param snapshot: for one picture
-        :raises NotFound: no such robot, or no right on it or to view this
-        :raises Unavailable: too many watch, or the relay is going down
+        :param snapshot: for one image
+        :raises NotFound: no such robot, or no right on it or to view the camera
+        :raises Unavailable: there are too many viewers, or the relay is shutting down
         """
         admission = await self.admit(principal, robot, address)
-        return self.watch(replace(admission, snapshot=snapshot), camera, settings, screen)
+        return self.watch(replace(admission, snapshot=snapshot), camera, settings, sink)
 
     def watch(
-        self, admission: AuthorizedSession, camera: str, settings: link.VideoSettings, screen: FrameSink
+        self, admission: Admission, camera: str, settings: link.VideoSettings, sink: FrameSink
     ) -> CameraViewer:
-        """The same for somebody who was admitted; whatever comes of it, the admission is used up."""
-        watching = CameraViewer(
+        """As :meth:`view`, for an authorized client. The admission is used up, also by an error."""
+        viewer = CameraViewer(
             admission.permit,
             admission.robot,
             camera,
             settings,
-            screen,
+            sink,
             address=admission.address,
-            over=self._left,
+            on_end=self._viewer_left,
             snapshot=admission.snapshot,
         )
         try:
             if not self.accepting:
-                raise ShuttingDown("the relay is going down; come again in a moment")
-            watching.begin(self._videos)
+                raise ShuttingDown("the relay is going down; try again in a moment")
+            viewer.start(self._videos)
         except SwitchboardError:
-            self.turn_away(admission)
+            self.release(admission)
             raise
-        self._watchings.add(watching)
-        self._registry.looks_on(watching.robot, watching)
-        self._tell_of_video("video.joined", watching, address=watching.address)
-        return watching
+        self._viewers.add(viewer)
+        self._registry.viewer_joined(viewer.robot, viewer)
+        self._publish_video_event("video.joined", viewer, address=viewer.address)
+        return viewer
 
-    def _left(self, watching: CameraViewer) -> None:
-        self._access.release(watching.permit)
-        self._watchings.discard(watching)
-        self._registry.looks_away(watching.robot, watching)
-        self._tell_of_video("video.left", watching, pictures=watching.pictures)
+    def _viewer_left(self, viewer: CameraViewer) -> None:
+        self._access.release(viewer.permit)
+        self._viewers.discard(viewer)
+        self._registry.viewer_left(viewer.robot, viewer)
+        self._publish_video_event("video.left", viewer, pictures=viewer.frames)
 
-    def _tell_of_video(self, kind: str, watching: CameraViewer, **data: Any) -> None:
-        principal = watching.permit.principal
-        self._journal.event(
-            kind,
-            f"user:{watching.name}",
-            # Not that of the user's other events: snapshots may come one a second.
-            cause=f"video:{principal.full}",
-            robot_id=watching.robot.robot_id,
-            user_id=principal.user_id,
-            **watching.about,
-            **data,
-        )
+    def _publish_video_event(self, kind: str, viewer: CameraViewer, **data: Any) -> None:
+        source = f"user:{viewer.name}"
+        self._bus.publish(kind, viewer.robot.robot_id, source, **viewer.event_data, **data)
 
-    # --- what robots there are ----------------------------------------------------------------------------
+    # --- robots of a principal ----------------------------------------------------------------------------
 
-    async def issue_ticket(self, principal: Principal, opens: TicketPurpose) -> str:
-        """A ticket for one use of a robot.
-
-        :raises NotFound: no such robot, or no right on it
-        """
-        for record, _ in await self._access.robots(principal):
-            if record.name == opens.robot:
-                return self._auth.issue_ticket(principal, opens)
-        raise NotFound(NO_ROBOT)
-
-    async def robots(self, principal: Principal) -> list[dict[str, Any]]:
-        """What the principal may see of its robots."""
+    async def robots(self, principal: Principal) -> list[RobotInfo]:
+        """Summaries of the principal's robots, by its rights."""
         return await self.overview.robots(principal)
 
     async def healthy(self) -> bool:
@@ -394,17 +324,32 @@ class SessionManager:
         return True
 
     def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call ``listener`` when something about robots may have changed; returns what ends that."""
+        """Call ``listener`` when robots may have changed; returns a function that ends that."""
         return self._registry.on_change(listener)
 
     def status(self) -> list[dict[str, Any]]:
-        """Every robot the relay knows and who works with it, for the administrator's own machine."""
+        """Every robot the relay knows, with its clients, for the administrator's own machine."""
         return self.overview.status()
 
-    def say_goodbye(self, reason: str) -> None:
-        """Refuse newcomers and close what is open: the relay is going down."""
+    def robot_moved(self, robot: RobotState) -> None:
+        """A robot has connected to another relay of the cluster, which its clients reach when they connect again."""
+        for client in self.clients_of(robot.robot_id):
+            client.close(
+                close_codes.UNAVAILABLE, f"robot {robot.name} has connected to another relay; connect again"
+            )
+
+    def shutdown(self, reason: str) -> None:
+        """The relay shuts down: refuse new clients, and close what is open."""
         self.accepting = False
-        for session in self:
-            session.close(close_codes.GOING_AWAY, reason)
-        for watching in list(self._watchings):
-            watching.end(ShuttingDown(reason))
+        self.close_all(reason)
+
+    def close_all(self, reason: str) -> None:
+        """Close the websockets of all clients, which may connect again."""
+        for client in self:
+            client.close(close_codes.GOING_AWAY, reason)
+        for viewer in list(self._viewers):
+            viewer.end(ShuttingDown(reason))
+
+
+def _ping_token() -> bytes:
+    return secrets.token_bytes(8)

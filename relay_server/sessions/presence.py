@@ -1,80 +1,200 @@
-"""Who is at a robot: users with their connections, and who watches which of its cameras (SPEC section 1.7)."""
+"""Robots and their users, as the HTTP API answers with them.
+
+Users of a robot with their connections, and viewers of its cameras (SPEC 1.7).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, TypedDict
 
 from relay_protocol.rights import Level, Operation, Rules
-from relay_server.robots.link_quality import LinkQuality, joined, milliseconds
-from relay_server.robots.registry import CameraViewers, RobotState
+from relay_server.control.view import OverrideInfo, StopInfo
+from relay_server.robots.link_quality import LinkQuality, LinkQualityInfo, Quality, joined, milliseconds
+from relay_server.robots.registry import RobotState, ViewerInfo
 
-TOLD = 100
-"""Most connections and watched cameras of one robot that are told."""
-
-FRESH_SECONDS = 0.5
-"""What was found out about connections is good for so long: everybody who is told asks once a second."""
+AvailabilityName = Literal["offline", "online", "in_use"]
 
 
-def client_rows(robot: RobotState, sessions: Iterable[ConnectedClient], rules: Rules) -> list[dict[str, Any]]:
-    """Who works with a robot, and who watches those of its cameras that somebody with these rights may view."""
-    found = [{"user": each.name, "since": each.since, "camera": ""} for each in sessions]
+class ClientInfo(TypedDict):
+    """A client of a robot, or a viewer of one of its cameras.
+
+    :param since: Unix seconds at which it connected
+    :param camera: empty for a client
+    """
+
+    user: str
+    since: float
+    camera: str
+
+
+class RobotInfo(TypedDict):
+    """A robot.
+
+    :param level: level of the caller's rights
+    :param people: number of its users and viewers
+    :param holder: the user who has control of it
+    :param battery: charge, 0 to 1
+    :param rtt_ms: round trip to it, milliseconds
+    :param last_seen: Unix seconds
+    """
+
+    name: str
+    description: str
+    state: AvailabilityName
+    level: Level
+    clients: list[ClientInfo]
+    people: int
+    holder: str | None
+    stopped: StopInfo | None
+    suppressed: list[OverrideInfo]
+    inhibited: list[OverrideInfo]
+    battery: float | None
+    rtt_ms: float | None
+    quality: Quality
+    host: str
+    platform: str
+    distro: str
+    last_seen: float | None
+
+
+class RobotPage(TypedDict):
+    """A page of the robots on which the caller has a right.
+
+    :param next: ``after`` of the next page, or empty
+    """
+
+    robots: list[RobotInfo]
+    next: str
+
+
+class RobotsUpdate(TypedDict):
+    """The live update ``robots``: all robots on which the caller has a right."""
+
+    robots: list[RobotInfo]
+
+
+class ConnectionInfo(TypedDict):
+    """One connection of a user.
+
+    :param client: number of the connection
+    :param since: Unix seconds at which it connected
+    :param drops: samples dropped because the client did not read in time
+    :param address: network address; empty unless the caller is an owner
+    """
+
+    client: int
+    since: float
+    you: bool
+    control: bool
+    rtt_ms: float | None
+    robot_rtt_ms: float | None
+    quality: Quality
+    drops: int
+    address: str
+
+
+class ViewedCamera(TypedDict):
+    """A camera that a user views."""
+
+    camera: str
+    since: float
+    address: str
+
+
+class RobotUser(TypedDict):
+    """A user of a robot."""
+
+    user: str
+    you: bool
+    control: bool
+    connections: list[ConnectionInfo]
+    watching: list[ViewedCamera]
+
+
+class RobotUsers(TypedDict):
+    """The users of a robot.
+
+    :param drops: samples that the robot has dropped since its daemon started
+    :param battery: charge, 0 to 1
+    :param more: number of connections and views that are left out
+    """
+
+    robot: str
+    state: AvailabilityName
+    link: LinkQualityInfo
+    drops: int | None
+    battery: float | None
+    people: list[RobotUser]
+    more: int
+
+
+MAX_LISTED = 100
+"""Most connections and camera viewers of one robot that are listed."""
+
+CACHE_SECONDS = 0.5
+"""Seconds for which a summary of connections is reused: each reader asks once a second."""
+
+
+def client_rows(robot: RobotState, sessions: Iterable[ConnectedClient], rules: Rules) -> list[ClientInfo]:
+    """The clients of a robot, and the viewers of those cameras that a reader with these rights may view."""
+    found = [ClientInfo(user=each.name, since=each.since, camera="") for each in sessions]
     found += [
-        {"user": each.name, "since": since, "camera": each.camera}
-        for each, since in robot.onlookers.items()
-        if _may_see(rules, each)
+        ClientInfo(user=each.name, since=since, camera=each.camera)
+        for each, since in robot.viewers.items()
+        if _may_view(rules, each)
     ]
     return found
 
 
 class ConnectedClient(Protocol):
-    """One connection of a client: a session, as far as this goes."""
+    """One connection of a client, as it is listed."""
 
     @property
     def number(self) -> int:
-        """What it is known by as long as the relay runs."""
+        """Number of the connection, unique in this relay."""
 
     @property
     def address(self) -> str:
-        """Where the client is."""
+        """Network address of the client."""
 
     @property
     def since(self) -> float:
-        """Unix time it came."""
+        """Unix seconds at which it connected."""
 
     @property
     def name(self) -> str:
-        """The user's."""
+        """Name of its user."""
 
     @property
     def drops(self) -> int:
-        """Samples it did not take in time."""
+        """Samples dropped because the client did not read in time."""
 
-    def reading(self) -> LinkQuality:
-        """How good the way to the client is."""
+    def link_quality(self) -> LinkQuality:
+        """The quality of the link to the client."""
 
 
 class ConnectionSummary(NamedTuple):
-    """The connections to a robot as they are told, the same for many askers. What it holds is never changed.
+    """The connections to a robot, shared by many readers and never changed.
 
-    :param at: when they were looked at, monotonic seconds
-    :param numbers: of all connections there were
-    :param holder: the number of the one that had control, 0 for none
-    :param people: by user, who came first standing first; nobody is "you" yet
+    :param at: when it was made, monotonic seconds
+    :param numbers: numbers of all connections
+    :param holder: number of the connection that had control, 0 for none
+    :param people: entries by user, the first to connect first; no user is marked as "you" yet
     """
 
     at: float
     numbers: list[int]
     holder: int
-    people: dict[str, dict[str, Any]]
+    people: dict[str, RobotUser]
 
 
 class PresenceReader(NamedTuple):
-    """Who is told.
+    """The reader of a list.
 
     :param user: its name
     :param rules: its rights on the robot
-    :param connection: number of its connection; ``None``: all of the user are its own
+    :param connection: number of its connection; ``None``: all connections of the user count as its own
     """
 
     user: str
@@ -83,7 +203,7 @@ class PresenceReader(NamedTuple):
 
 
 class PresenceService:
-    """Tells who is at which robot.
+    """Lists the users of robots.
 
     :param sessions: the open sessions of a robot by its id, oldest first
     :param holder: the number of the connection that has control of a robot, 0 for none
@@ -99,99 +219,103 @@ class PresenceService:
         self._sessions = sessions
         self._holder = holder
         self._seconds = seconds
-        self._crowds: dict[tuple[int, bool], ConnectionSummary] = {}
+        self._summaries: dict[tuple[int, bool], ConnectionSummary] = {}
 
-    def told(self, robot: RobotState, asker: PresenceReader) -> tuple[list[dict[str, Any]], int]:
-        """Who is at a robot, by user, who came first standing first; and how many connections are left out."""
-        owner = asker.rules.level is Level.OWNER
-        crowd = self._crowd(robot, owner)
-        people = dict(crowd.people)
-        if asker.user in people:
-            people[asker.user] = _yourself(people[asker.user], asker)
-        watched = [(each, at) for each, at in robot.onlookers.items() if _may_see(asker.rules, each)]
-        count = len(crowd.numbers)
-        room = max(0, TOLD - count)
-        for onlooker, since in watched[:room]:
-            # A new one each time: what the crowd holds is for others too.
-            person = people.get(onlooker.name) or _person(onlooker.name) | {
-                "you": onlooker.name == asker.user
-            }
-            sight = {"camera": onlooker.camera, "since": since, "address": onlooker.address if owner else ""}
-            people[onlooker.name] = {**person, "watching": [*person["watching"], sight]}
-        more = max(0, count - TOLD) + max(0, len(watched) - room)
+    def users(self, robot: RobotState, reader: PresenceReader) -> tuple[list[RobotUser], int]:
+        """Users of a robot, the first to connect first; and the number of connections and viewers left out."""
+        owner = reader.rules.level is Level.OWNER
+        summary = self._summary(robot, owner)
+        people = dict(summary.people)
+        if reader.user in people:
+            people[reader.user] = _own_entry(people[reader.user], reader)
+        watched = [(each, at) for each, at in robot.viewers.items() if _may_view(reader.rules, each)]
+        count = len(summary.numbers)
+        room = max(0, MAX_LISTED - count)
+        for viewer, since in watched[:room]:
+            # A new entry, since the summary is shared with other readers.
+            entry = people.get(viewer.name) or _user_entry(viewer.name, you=viewer.name == reader.user)
+            address = viewer.address if owner else ""
+            view = ViewedCamera(camera=viewer.camera, since=since, address=address)
+            people[viewer.name] = {**entry, "watching": [*entry["watching"], view]}
+        more = max(0, count - MAX_LISTED) + max(0, len(watched) - room)
         return (sorted(people.values(), key=_since) if watched else list(people.values())), more
 
     def count(self, robot: RobotState, rules: Rules) -> int:
-        """How many users are at a robot, for somebody with these rights."""
+        """Number of a robot's users and viewers, as far as a reader with these rights may know of them."""
         users = {each.name for each in self._sessions(robot.robot_id)}
-        return len(users | {each.name for each in robot.onlookers if _may_see(rules, each)})
+        return len(users | {each.name for each in robot.viewers if _may_view(rules, each)})
 
-    def _crowd(self, robot: RobotState, owner: bool) -> ConnectionSummary:
-        """The connections to a robot; looked at once for all who ask at a time."""
+    def _summary(self, robot: RobotState, owner: bool) -> ConnectionSummary:
+        """The connections to a robot, summarised once for all readers within :data:`CACHE_SECONDS`."""
         key, now, holder = (robot.robot_id, owner), self._seconds(), self._holder(robot)
         sessions = list(self._sessions(robot.robot_id))
         numbers = [each.number for each in sessions]
-        known = self._crowds.get(key)
+        known = self._summaries.get(key)
         if (
             known is not None
-            and now - known.at < FRESH_SECONDS
+            and now - known.at < CACHE_SECONDS
             and known.holder == holder
             and known.numbers == numbers
         ):
             return known
-        crowd = ConnectionSummary(now, numbers, holder, _by_user(sessions, robot.reading(), holder, owner))
+        summary = ConnectionSummary(
+            now, numbers, holder, _by_user(sessions, robot.link_quality(), holder, owner)
+        )
         if numbers:
-            self._crowds[key] = crowd
+            self._summaries[key] = summary
         else:
-            self._crowds.pop(key, None)
-        return crowd
+            self._summaries.pop(key, None)
+        return summary
 
 
 def _by_user(
-    sessions: list[ConnectedClient], onward: LinkQuality, holder: int, owner: bool
-) -> dict[str, dict[str, Any]]:
-    """Users with their connections, as many as are told; who holds control is, however many there are."""
-    told = sorted(sessions, key=lambda each: each.number != holder)[:TOLD]
-    people: dict[str, dict[str, Any]] = {}
-    for each in told:
-        person = people.setdefault(each.name, _person(each.name))
-        person["control"] = person["control"] or each.number == holder
-        person["connections"].append(_connection(each, onward, each.number == holder, owner))
+    sessions: list[ConnectedClient], robot_link: LinkQuality, holder: int, owner: bool
+) -> dict[str, RobotUser]:
+    """Users with their connections, at most :data:`MAX_LISTED`; the holder of control is always listed."""
+    listed = sorted(sessions, key=lambda each: each.number != holder)[:MAX_LISTED]
+    people: dict[str, RobotUser] = {}
+    for each in listed:
+        entry = people.setdefault(each.name, _user_entry(each.name))
+        entry["control"] = entry["control"] or each.number == holder
+        entry["connections"].append(_connection(each, robot_link, each.number == holder, owner))
     return {each["user"]: each for each in sorted(people.values(), key=_since)}
 
 
-def _person(user: str) -> dict[str, Any]:
-    return {"user": user, "you": False, "control": False, "connections": [], "watching": []}
+def _user_entry(user: str, *, you: bool = False) -> RobotUser:
+    return {"user": user, "you": you, "control": False, "connections": [], "watching": []}
 
 
-def _connection(session: ConnectedClient, onward: LinkQuality, control: bool, owner: bool) -> dict[str, Any]:
-    link = session.reading()
+def _connection(
+    session: ConnectedClient, robot_link: LinkQuality, control: bool, owner: bool
+) -> ConnectionInfo:
+    link = session.link_quality()
     return {
         "client": session.number,
         "since": session.since,
         "you": False,
         "control": control,
         "rtt_ms": milliseconds(link.rtt),
-        "robot_rtt_ms": milliseconds(joined(link, onward).rtt),
+        "robot_rtt_ms": milliseconds(joined(link, robot_link).rtt),
         "quality": link.quality,
         "drops": session.drops,
         "address": session.address if owner else "",
     }
 
 
-def _yourself(person: dict[str, Any], asker: PresenceReader) -> dict[str, Any]:
-    """The person as he himself is told."""
-    connections = [
-        {**each, "you": asker.connection is None or each["client"] == asker.connection}
-        for each in person["connections"]
+def _own_entry(entry: RobotUser, reader: PresenceReader) -> RobotUser:
+    """The entry of the reader's own user."""
+    connections: list[ConnectionInfo] = [
+        {**each, "you": reader.connection is None or each["client"] == reader.connection}
+        for each in entry["connections"]
     ]
-    return {**person, "you": True, "connections": connections}
+    return {**entry, "you": True, "connections": connections}
 
 
-def _may_see(rules: Rules, onlooker: CameraViewers) -> bool:
-    return rules.judge(Operation.VIEW, onlooker.camera).allowed
+def _may_view(rules: Rules, viewer: ViewerInfo) -> bool:
+    return rules.decide(Operation.VIEW, viewer.camera).allowed
 
 
-def _since(person: dict[str, Any]) -> float:
-    """When the first of a user's connections came, or when it began to watch."""
-    return float(min(each["since"] for each in (*person["connections"], *person["watching"])))
+def _since(entry: RobotUser) -> float:
+    """Unix seconds of a user's first connection or view."""
+    times = [each["since"] for each in entry["connections"]]
+    return min(times + [each["since"] for each in entry["watching"]])

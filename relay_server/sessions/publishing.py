@@ -1,60 +1,61 @@
-"""What a client publishes to the robot: judged by right and, where it moves the robot, by age."""
+"""Messages that a client publishes to the robot: checked by rights and, if they move it, by control and age."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from relay_protocol import link, rosbridge
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import KIB
+from relay_protocol.release_rule import RELEASE_NS, CommandStreams
 from relay_protocol.rights import Operation, Rules
-from relay_server.channels.publications import HELD_SECONDS
-from relay_server.channels.robot_link import resolve
-from relay_server.channels.topics import ClientPublication
-from relay_server.control.types import LET_GO_SECONDS, ControlSnapshot
-from relay_server.sessions.message_age import MessageAge
-from relay_server.sessions.rearm import ReleaseTracker, is_zero_command
-from relay_server.sessions.type_names import normal_type
+from relay_server.channels.names import normal_type, resolve
+from relay_server.channels.publications import QUEUED_SECONDS, RobotPublication
+from relay_server.control.types import ControlSnapshot
+from relay_server.sessions.context import ClientContext
+from relay_server.sessions.motion_requests import too_old
+from relay_server.sessions.zero_command import is_zero_command
 
-if TYPE_CHECKING:
-    from relay_server.sessions.session import Session
+QUEUED_NS = round(QUEUED_SECONDS * 1e9)
+"""Nanoseconds that a message other than a command may wait to be sent."""
 
-NO_DEADLINE = round(HELD_SECONDS * 1e9)
-"""Nanoseconds a message that is no command may wait to be sent."""
+TOPICS = 64
+"""Most topics of one client of which refused commands are remembered; the least recent is forgotten first."""
 
-ROUTES = 256
-"""Topics of which one client's routes are kept."""
+DECISIONS = 256
+"""Most decisions cached for one client."""
 
-DROVE_NS = 250_000_000
-"""Nanoseconds after a command that moves in which no other is looked at for whether it does: that takes time."""
+MOTION_NS = 250_000_000
+"""Nanoseconds after a moving command during which no command is parsed for motion, as parsing takes time."""
 
 LATEST_BYTES = 4 * KIB
+"""Longest command, in bytes, that is kept as a decision's latest."""
 LONG = b"long"
-"""A command with more bytes than that is not kept, and counts as one that moves."""
+"""Kept in place of a longer command, which counts as one that moves."""
 
 WAITING_TOPICS = 16
 WAITING_BYTES = 64 * KIB
-"""Commands of one client that wait for control: the newest to each of so many topics, none larger than this."""
+"""Limits of the commands of one client that wait for control: the newest of each topic, none larger than this."""
 
 
-class Route:
-    """What was found out about a topic this client may publish to, and on what that was founded.
+class PublishDecision:
+    """The cached decision that this client may publish to a topic, with the objects it was derived from.
 
     :param type: as the client wrote it in ``publish``
-    :param motion: whether the robot's own safety counts the topic as motion; then commands have a deadline
-    :param standing: who commands the robot
-    :param passes: whether this client does, there
+    :param motion: whether the robot counts the topic as motion; its commands then have a maximum age
+    :param control: snapshot of who controls the robot
+    :param passes: whether commands of this client pass
     """
 
     __slots__ = (
-        "deadline",
+        "advertisers",
+        "control",
         "description",
-        "holders",
         "latest",
+        "max_age_ns",
         "passes",
         "publication",
         "rules",
-        "standing",
         "type",
     )
 
@@ -63,334 +64,327 @@ class Route:
         type: str,
         rules: Rules,
         description: link.Describe,
-        publication: ClientPublication,
+        publication: RobotPublication,
         motion: bool,
-        standing: ControlSnapshot,
+        control: ControlSnapshot,
         passes: bool,
     ) -> None:
         self.type = type
         self.rules = rules
         self.description = description
         self.publication = publication
-        self.holders = publication.holders
-        self.standing = standing
+        self.advertisers = publication.advertisers
+        self.control = control
         self.passes = passes
-        self.deadline = description.motion.deadline_ms * 1_000_000 if motion else None
-        """Nanoseconds; the greatest age a command may have."""
+        self.max_age_ns = description.motion.deadline_ms * 1_000_000 if motion else None
+        """Greatest age of a command, nanoseconds; ``None``: messages of this topic do not move the robot."""
         self.latest: bytes | None = None
-        """The latest command that passed, :data:`LONG` for a long one."""
+        """JSON of the latest command that passed; :data:`LONG` for a long one."""
 
 
 class _WaitingCommand(NamedTuple):
     """A command that waits for control of the robot.
 
-    :param stamp: the relay's monotonic nanoseconds before which it can't have been sent
+    :param earliest_sent: see :class:`relay_server.sessions.message_age.MessageAge`
     """
 
-    ask: rosbridge.Publish
-    stamp: int
+    operation: rosbridge.Publish
+    earliest_sent: int
 
 
 class PublishHandler:
-    """The messages of one session on their way to the robot."""
+    """Publishes the messages of one session."""
 
     __slots__ = (
-        "_begun",
-        "_desk",
-        "_freshness",
-        "_grips",
-        "_held",
+        "_age",
+        "_client",
+        "_controller",
+        "_decisions",
+        "_motion",
+        "_noted",
+        "_noted_holder",
         "_number",
         "_permit",
         "_robot",
-        "_routes",
-        "_session",
+        "_streams",
         "_waiting",
-        "commanded",
-        "drove",
-        "stale_commands",
     )
 
-    def __init__(self, session: Session, freshness: MessageAge) -> None:
-        self._session = session
-        self._permit = session.permit
-        self._robot = session.robot
-        self._desk = session.desk
-        self._number = session.number
-        self._freshness = freshness
-        self._routes: dict[str, Route] = {}
-        self._begun: set[str] = set()
-        """Topics of which the first message was noted."""
+    def __init__(self, client: ClientContext) -> None:
+        self._client = client
+        self._permit = client.permit
+        self._robot = client.robot
+        self._controller = client.controller
+        self._number = client.number
+        self._age = client.age
+        self._motion = client.motion
+        self._decisions: dict[str, PublishDecision] = {}
+        client.motion.topics = self._decisions
+        self._noted: dict[str, None] = {}
+        """Topics of which ``publication.begun`` was published as an activity."""
         self._waiting: dict[str, _WaitingCommand] = {}
-        """The newest command to each topic, while the robot is being told that it comes from here."""
-        self._grips = ReleaseTracker()
-        self._held: object = None
-        """The latest tenure of control in which this client has moved the robot."""
-        self.stale_commands = 0
-        self.commanded = 0
-        """The relay's monotonic nanoseconds before which the latest command can't have been sent."""
-        self.drove = 0
-        """The same for the latest one that passed and was no zero, give or take :data:`DROVE_NS`."""
+        """The newest command of each topic, while the robot is being notified that this client controls it."""
+        self._streams: CommandStreams[str] = CommandStreams(TOPICS)
+        self._noted_holder: object = None
+        """The latest holder of control for which ``motion.begun`` was published as an activity."""
 
-    def advertise(self, ask: rosbridge.Advertise) -> None:
-        """The client is going to publish."""
-        session = self._session
-        session.judge(Operation.PUBLISH, resolve(ask.topic))
-        session.channel.publications.advertise(session, ask, normal_type(ask.type))
+    def advertise(self, operation: rosbridge.Advertise) -> None:
+        """Advertise a topic."""
+        client = self._client
+        client.require(Operation.PUBLISH, resolve(operation.topic))
+        client.channel.publications.advertise(client, operation, normal_type(operation.type))
 
-    def unadvertise(self, ask: rosbridge.Unadvertise) -> None:
-        """The client takes an advertisement back."""
-        session = self._session
-        session.channel.publications.unadvertise(session, resolve(ask.topic), ask.id)
+    def unadvertise(self, operation: rosbridge.Unadvertise) -> None:
+        """Withdraw an advertisement."""
+        client = self._client
+        client.channel.publications.unadvertise(client, resolve(operation.topic), operation.id)
 
-    def publish(self, ask: rosbridge.Publish) -> None:
-        """One message to the robot.
+    def publish(self, operation: rosbridge.Publish) -> None:
+        """Publish one message to the robot.
 
-        The route found before holds while all it was founded on is the same: rights are compiled anew when they
-        change, a robot's words about itself and who commands it are replaced as a whole. So nothing has to be told of a
-        change.
+        A decision is valid while it was derived from the current objects: rules, description and control snapshot are
+        replaced as a whole when they change. So decisions need no notification of changes.
 
-        :raises Refused: the client may not publish there, or somebody else commands the robot
+        :raises Refused: the client has no right to publish to the topic, or another client controls the robot
         :raises Unavailable: the robot is offline
-        :raises Invalid: no such topic, or of another type
+        :raises Invalid: there is no such topic, or it has another type
         """
-        session, robot = self._session, self._robot
-        route = self._routes.get(ask.topic)
-        if (
-            route is None
-            or route.rules is not self._permit.rules
-            or route.description is not robot.description
-            or route.standing is not self._desk.standing
-            or session not in route.holders
-            or ask.type != route.type
-            or robot.control is None
-        ):
-            route = self._find(ask)
-        freshness, deadline, left = self._freshness, route.deadline, NO_DEADLINE
-        if deadline is not None:
-            # Each message by a reading of the clock of its own: an earlier one, of the chunk it came in, would make it
-            # too young.
-            left = deadline - freshness.age()
+        client, decision = self._client, self._decision(operation)
+        age, max_age_ns, left = self._age, decision.max_age_ns, QUEUED_NS
+        if max_age_ns is not None:
+            # The clock is read for each message: the arrival time of its chunk would make it too young.
+            left = max_age_ns - age.now() + age.earliest_sent
             if left < 0:
-                if not route.passes:
-                    # Of a zero that is so old nobody knows what the hand has done since.
-                    self._in_vain(route, still=False)
-                self._stale(route, deadline - left, ask.id)
+                if not decision.passes:
+                    # Even a zero releases nothing then: the client may have sent other commands after it.
+                    self._record_refused(decision, zero=False)
+                self._drop_stale(decision, max_age_ns - left, operation.id)
                 return
-            self.commanded = freshness.not_before
-            if not route.passes and not self._let_by(route, ask):
+            self._motion.last_command = age.earliest_sent
+            if not decision.passes and not self._pass_or_acquire_control(decision, operation):
                 return
-            if freshness.not_before - self.drove > DROVE_NS:
-                self._drives(route, ask)
-        publication = route.publication
-        send, body, stamp = publication.send, bytes(ask.msg), freshness.not_before
-        if deadline is not None:
-            route.latest = body if len(body) <= LATEST_BYTES else LONG
+            if age.earliest_sent - self._motion.last_motion > MOTION_NS:
+                self._note_motion(decision, operation)
+        publication = decision.publication
+        send, body, earliest_sent = publication.send, bytes(operation.msg), age.earliest_sent
+        if max_age_ns is not None:
+            decision.latest = body if len(body) <= LATEST_BYTES else LONG
         if send is None:
-            session.channel.publications.publish(session, publication, body, stamp, ask.id, left / 1e9)
+            client.channel.publications.publish(
+                client, publication, body, earliest_sent, operation.id, left / 1e9
+            )
             return
         try:
-            send(body, stamp, self._number)
+            send(earliest_sent, self._number, body)
         except SwitchboardError as error:
-            session.tell("error", f"publish {publication.topic}: {error}", ask.id)
+            client.notify("error", f"publish {publication.topic}: {error}", operation.id)
 
-    def _find(self, ask: rosbridge.Publish) -> Route:
-        self._routes.pop(ask.topic, None)
-        session = self._session
-        robot, rules = session.robot, session.permit.rules
-        topic = resolve(ask.topic)
-        session.judge(Operation.PUBLISH, topic)
-        if robot.control is None:
-            self._desk.unheard(session)
-            self._grips.in_vain(topic, self._now())
+    def publish_encoded(self, operation: rosbridge.Publish, cdr: bytes) -> bool:
+        """Publish a message that is CDR of the topic's type already; it is not decoded, and never waits.
+
+        :param operation: of which ``msg`` is not used
+        :returns: whether it was sent; false: the robot has no publisher yet, or speaks JSON
+        :raises Refused: as for :meth:`publish`; or messages of this topic move the robot, so they must be judged
+        :raises SwitchboardError: as for :meth:`publish`
+        """
+        decision = self._decision(operation)
+        publication = decision.publication
+        if decision.max_age_ns is not None or publication.motion:
+            raise Refused(f"messages to {publication.topic} move the robot; send them as JSON")
+        send = publication.send_encoded or self._client.channel.publications.encoded_sender(publication)
+        if send is None:
+            return False
+        send(self._age.earliest_sent, self._number, cdr)
+        return True
+
+    def _decision(self, operation: rosbridge.Publish) -> PublishDecision:
+        """The decision for a topic, the cached one if it is valid; errors as for :meth:`publish`."""
+        decision = self._decisions.get(operation.topic)
+        if (
+            decision is None
+            or decision.rules is not self._permit.rules
+            or decision.description is not self._robot.description
+            or decision.control is not self._controller.snapshot
+            or self._client not in decision.advertisers
+            or operation.type != decision.type
+            or self._robot.control_link is None
+        ):
+            decision = self._decide(operation)
+        return decision
+
+    def _decide(self, operation: rosbridge.Publish) -> PublishDecision:
+        self._decisions.pop(operation.topic, None)
+        client = self._client
+        robot, rules = client.robot, client.permit.rules
+        topic = resolve(operation.topic)
+        client.require(Operation.PUBLISH, topic)
+        if robot.control_link is None:
+            self._controller.published_while_offline(client)
+            self._streams.refused(topic, self._now())
             raise Unavailable(f"robot {robot.name} is offline; the message was dropped")
-        publication = session.channel.publications.get(session, ask, topic, normal_type(ask.type))
+        publication = client.channel.publications.find_or_advertise(
+            client, operation, topic, normal_type(operation.type)
+        )
         motion = robot.is_motion(topic, publication.type)
-        if len(self._routes) >= ROUTES:
-            self._routes.clear()
-        desk = self._desk
-        route = self._routes[ask.topic] = Route(
-            ask.type,
+        if len(self._decisions) >= DECISIONS:
+            self._decisions.clear()
+        controller = self._controller
+        decision = self._decisions[operation.topic] = PublishDecision(
+            operation.type,
             rules,
             robot.description,
             publication,
             motion,
-            desk.standing,
-            not motion or (desk.passes(session, topic) and not self._must_let_go(topic)),
+            controller.snapshot,
+            not motion or (controller.may_command(client, topic) and not self._must_release(topic)),
         )
-        if not motion and topic not in self._begun and len(self._begun) < ROUTES:
-            # Commands are noted when they move the robot.
-            self._begun.add(topic)
-            session.notice("publication.begun", topic=topic)
-        return route
+        if not motion and topic not in self._noted and len(self._noted) < DECISIONS:
+            # Commands are an activity when they move the robot, see :meth:`_note_motion`.
+            self._noted[topic] = None
+            client.activity("publication.begun", topic=topic)
+        return decision
 
-    def _must_let_go(self, topic: str) -> bool:
-        """Whether the client went on commanding in vain until it got control (SPEC section 1.7)."""
-        desk, session = self._desk, self._session
-        if session.number in desk.standing.suppressed.get(topic, ()):
+    def _must_release(self, topic: str) -> bool:
+        """Whether the client commanded without control, and has not released since (SPEC 1.7)."""
+        controller, client = self._controller, self._client
+        if client.number in controller.snapshot.suppressed.get(topic, ()):
             return False
-        # By when it can have been sent at the earliest: a link that stalls is no silence of the client.
-        return desk.lease.held_by(session) and self._grips.holds(topic, self._freshness.not_before)
+        # Judged by the earliest time at which it can have been sent: a stalled link is not a release.
+        return controller.lease.held_by(client) and self._streams.must_release(topic, self._age.earliest_sent)
 
-    def _let_by(self, route: Route, ask: rosbridge.Publish) -> bool:
-        """Whether a command goes to the robot though its route does not pass; else it waits.
+    def _pass_or_acquire_control(self, decision: PublishDecision, operation: rosbridge.Publish) -> bool:
+        """Check a command that the decision does not let pass. Control is acquired for it if the robot is free.
 
-        :raises Refused: as :meth:`_claim`, or the client must let go first
+        :returns: whether it passes now; otherwise it waits until this client has control
+
+        :raises Refused: as :meth:`_queue_and_request_control`, or the client must release the controls first
         """
-        topic = route.publication.topic
-        if not self._desk.passes(self._session, topic):
-            still = _is_still(route, ask)
-            if still and self._is_mere_zero(route):
-                # The robot judges it, as it does all commands.
-                self._grips.let_go(topic)
-                self._desk.zero(self._session)
+        topic = decision.publication.topic
+        if not self._controller.may_command(self._client, topic):
+            is_zero = _is_zero(decision, operation)
+            if is_zero and self._only_stops(decision):
+                # The robot checks it, as it does all commands.
+                self._streams.zero(topic)
+                self._controller.check_zero_command(self._client)
                 return True
-            self._claim(route, ask, still)
+            self._queue_and_request_control(decision, operation, is_zero)
             return False
-        if self._must_let_go(topic):
-            self._in_vain(route, _is_still(route, ask))
-        if self._must_let_go(topic):
+        if self._must_release(topic):
+            self._record_refused(decision, _is_zero(decision, operation))
+        # If it is zero, recording it has released the controls.
+        if self._must_release(topic):
             raise Refused(
-                f"let go first: you went on commanding {topic} without control of robot {self._robot.name}; "
-                f"say zero, or nothing for {LET_GO_SECONDS:g} s"
+                f"release the controls first: you went on commanding {topic} without control of robot "
+                f"{self._robot.name}; send zero, or nothing for {RELEASE_NS / 1e9:g} s"
             )
-        route.passes = True
+        decision.passes = True
         return True
 
-    def _is_mere_zero(self, route: Route) -> bool:
-        """Whether a zero has nothing to stop: it takes no control.
+    def _only_stops(self, decision: PublishDecision) -> bool:
+        """Whether a zero passes without acquiring control, because it only stops the robot.
 
-        One that comes while control is being taken does: by it the one that waits is taken back. Where the robot counts
-        a topic as motion by its name, all zeros may be a goal.
+        A zero that arrives while control is being acquired replaces the command that waits. On a topic that counts as
+        motion by its name, a zero may be a goal, such as a pose on ``goal_pose``, so it acquires control.
         """
-        commands = route.publication.type in self._robot.description.motion.types
-        return commands and not self._desk.lease.coming_to(self._session)
+        commands = decision.publication.type in self._robot.description.motion.types
+        return commands and not self._controller.lease.pending_for(self._client)
 
-    def _drives(self, route: Route, ask: rosbridge.Publish) -> None:
-        """A command has passed: one that moves keeps control from idling, while the robot is not stopped."""
-        if route.standing.stopped is None and not _is_still(route, ask):
-            self.drove = self._freshness.not_before
-            holder = self._desk.lease.holder
-            if holder is not self._held and self._desk.lease.held_by(self._session):
-                self._held = holder
-                self._session.notice("motion.begun", topic=route.publication.topic)
+    def _note_motion(self, decision: PublishDecision, operation: rosbridge.Publish) -> None:
+        """Record a command that has passed; if it moves the robot, control is not idle."""
+        if decision.control.stopped is None and not _is_zero(decision, operation):
+            self._motion.last_motion = self._age.earliest_sent
+            holder = self._controller.lease.holder
+            if holder is not self._noted_holder and self._controller.lease.held_by(self._client):
+                self._noted_holder = holder
+                self._client.activity("motion.begun", topic=decision.publication.topic)
 
-    def _in_vain(self, route: Route, still: bool) -> None:
-        """A command was refused, held back or too old.
+    def _record_refused(self, decision: PublishDecision, zero: bool) -> None:
+        """Record a command that was refused, queued or too old; the client may have to release the controls later.
 
-        :param still: whether it said zero
+        :param zero: whether it was zero
         """
-        topic, now = route.publication.topic, self._now()
-        if still:
-            self._grips.let_go(topic)
-        elif self._desk.in_vain(self._session) or self._grips.holds(topic, self._freshness.not_before):
-            self._grips.in_vain(topic, now)
+        topic, now = decision.publication.topic, self._now()
+        if zero:
+            self._streams.zero(topic)
+        elif self._controller.commands_without_control(self._client) or self._streams.must_release(
+            topic, self._age.earliest_sent
+        ):
+            self._streams.refused(topic, now)
 
     def _now(self) -> int:
         """The relay's monotonic nanoseconds."""
-        return self._freshness.not_before + self._freshness.age()
+        return self._age.now()
 
-    def _claim(self, route: Route, ask: rosbridge.Publish, still: bool) -> None:
-        """A command of who does not command the robot: it waits if the robot is being told that it now does.
+    def _queue_and_request_control(
+        self, decision: PublishDecision, operation: rosbridge.Publish, zero: bool
+    ) -> None:
+        """Queue a command until this client has control, and request control for it.
 
-        :param still: whether it says zero
-        :raises Refused: somebody else commands the robot, or control must be taken first
+        :param zero: whether it is zero
+        :raises Refused: another client controls the robot, or control must be taken first
         """
-        topic = route.publication.topic
-        if len(bytes(ask.msg)) > WAITING_BYTES or (
+        topic = decision.publication.topic
+        if len(bytes(operation.msg)) > WAITING_BYTES or (
             topic not in self._waiting and len(self._waiting) >= WAITING_TOPICS
         ):
-            self._ask_for_control(route, still)
-            raise Refused(f"control is just being taken; a command to {topic} can't wait for it")
-        # Before it is asked for, since the answer may be there at once.
-        self._waiting[topic] = _WaitingCommand(ask, self._freshness.not_before)
+            self._request_control(decision, zero)
+            raise Refused(
+                f"control is being acquired; a command to {topic} can't wait for it and was dropped"
+            )
+        # Before the request, since the answer may come at once.
+        self._waiting[topic] = _WaitingCommand(operation, self._age.earliest_sent)
         try:
-            self._ask_for_control(route, still)
+            self._request_control(decision, zero)
         except SwitchboardError:
             self._waiting.pop(topic, None)
             raise
 
-    def _ask_for_control(self, route: Route, still: bool) -> None:
-        grips = self._grips
-        if not self._desk.lease.coming_to(self._session):
-            # A command that takes a free robot moves it: programs that know nothing of control begin so.
-            self._grips = ReleaseTracker()
+    def _request_control(self, decision: PublishDecision, zero: bool) -> None:
+        streams = self._streams
+        if not self._controller.lease.pending_for(self._client):
+            # The first command to a free robot acquires control, for programs that do not use control explicitly.
+            self._streams = CommandStreams(TOPICS)
         try:
-            self._desk.claim(self._session)
+            self._controller.acquire_by_command(self._client)
         except SwitchboardError:
-            self._grips = grips
-            self._in_vain(route, still)
+            self._streams = streams
+            self._record_refused(decision, zero)
             raise
 
-    def commands(self) -> None:
-        """The client moves the robot by something else than a message."""
-        self.commanded = self.drove = self._freshness.not_before
-
-    def judge_age(self, what: str, stamp: int) -> None:
-        """See that something else than a message that moves the robot is not too old by now; what is, is counted.
-
-        :param stamp: the relay's monotonic nanoseconds before which it can't have been sent
-        :raises Refused: it may be too old
-        """
-        with self._freshness.as_of(stamp):
-            age = self._freshness.age()
-        deadline_ms = self._robot.description.motion.deadline_ms
-        if age > deadline_ms * 1_000_000:
-            self.stale_commands += 1
-            raise Refused(_too_old(f"{what} was refused", age, deadline_ms))
-
     def control_changed(self) -> None:
-        """Who commands the robot is another: what waited for that goes, or is dropped."""
-        lease, session = self._desk.lease, self._session
-        if not self._waiting or lease.coming_to(session):
+        """Send or drop the commands that waited, as the holder of control has changed."""
+        lease, client = self._controller.lease, self._client
+        if not self._waiting or lease.pending_for(client):
             return
         waiting, self._waiting = self._waiting, {}
-        if not lease.held_by(session):
-            # Why not, the desk has told.
+        if not lease.held_by(client):
+            # The controller has sent the reason.
             return
         for each in waiting.values():
-            with self._freshness.as_of(each.stamp):
-                self._again(each)
+            with self._age.as_of(each.earliest_sent):
+                self._publish_again(each)
 
-    def _again(self, waiting: _WaitingCommand) -> None:
-        """A command that waited is judged once more, as old as it is."""
+    def _publish_again(self, waiting: _WaitingCommand) -> None:
+        """Publish a command that waited; it is checked again, at its age.
+
+        If the client has unadvertised the topic meanwhile, it is advertised for this command only.
+        """
+        client, topic = self._client, resolve(waiting.operation.topic)
+        publications = client.channel.publications
+        unadvertised = client not in publications.advertisers(topic)
         try:
-            self.publish(waiting.ask)
+            self.publish(waiting.operation)
         except SwitchboardError as error:
-            self._session.refuse(waiting.ask, error)
+            client.refuse(waiting.operation, error)
+        if unadvertised and client in publications.advertisers(topic):
+            publications.unadvertise(client, topic, None)
 
-    @property
-    def silent_ns(self) -> int:
-        """Nanoseconds since the latest command."""
-        return self._now() - self.commanded
-
-    @property
-    def idle_ns(self) -> int:
-        """Nanoseconds since the latest command that moves."""
-        return self._now() - self.drove
-
-    @property
-    def holds_on(self) -> bool:
-        """Whether the latest command on any topic that passed was no zero."""
-        routes = self._routes.values()
-        return any(
-            each.latest is not None and not is_zero_command(each.publication.type, each.latest)
-            for each in routes
-        )
-
-    def _stale(self, route: Route, age: int, id: rosbridge.Id) -> None:
-        self.stale_commands += 1
-        deadline_ms = route.description.motion.deadline_ms
-        words = _too_old(f"a command to {route.publication.topic} was dropped", age, deadline_ms)
-        self._session.tell("warning", words, id)
+    def _drop_stale(self, decision: PublishDecision, age: int, id: rosbridge.Id) -> None:
+        self._motion.stale_commands += 1
+        deadline_ms = decision.description.motion.deadline_ms
+        text = too_old(f"a command to {decision.publication.topic} was dropped", age, deadline_ms)
+        self._client.notify("warning", text, id)
 
 
-def _is_still(route: Route, ask: rosbridge.Publish) -> bool:
-    return is_zero_command(route.publication.type, bytes(ask.msg))
-
-
-def _too_old(what: str, age: int, deadline_ms: int) -> str:
-    return (
-        f"{what}: it may be {age / 1e6:.0f} ms old, by the last ping answered; "
-        f"the robot takes none older than {deadline_ms} ms"
-    )
+def _is_zero(decision: PublishDecision, operation: rosbridge.Publish) -> bool:
+    return is_zero_command(decision.publication.type, bytes(operation.msg))

@@ -1,49 +1,51 @@
-"""What one client's work takes of its user's share of the processor."""
+"""Counts the processor time of a session towards its user's quota (:mod:`relay_server.common.cpu_quota`)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from relay_protocol.errors import Refused
 from relay_server.common import close_codes
-from relay_server.common.cpu_quota import DEBT
-
-if TYPE_CHECKING:
-    from relay_server.sessions.session import Session
+from relay_server.common.concurrency import FairQueue
+from relay_server.common.cpu_quota import DEBT, UserQuota
 
 REFUSAL = 5e-6
-"""Seconds it takes to refuse something."""
+"""Seconds of processor time that a refusal takes."""
 
 ROUND_TRIP = 150e-6
-"""Seconds it takes to send a question to a robot and to hand on the answer, beside what is timed."""
+"""Seconds of processor time to send a request to a robot and to pass on the answer, beside what is timed."""
 
 
 class SessionQuota:
-    """Work for one session, on its user's account.
+    """Counts processor time spent for one session towards its user's quota.
 
-    :ivar counting: whether what is done now is timed already; what is done within it is counted along
+    :param user: the quota of its user, over all connections
+    :param fair_queue: of all sessions of the robot that wait for its answer
+    :param close: closes the connection with a code and a reason; the session replaces it
+    :ivar counting: whether the work done now is timed already; work nested in it is not timed again
     """
 
-    __slots__ = ("_session", "counting")
+    __slots__ = ("_fair_queue", "close", "counting", "user")
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, user: UserQuota, fair_queue: FairQueue, close: Callable[[int, str], None]) -> None:
+        self.user = user
+        self._fair_queue = fair_queue
+        self.close = close
         self.counting = False
 
     def check(self) -> None:
-        """:raises Refused: the user has used up his share of the processor"""
-        if self._session.allowance.requests.left <= 0:
+        """:raises Refused: the user's CPU quota is used up"""
+        if self.user.requests.left <= 0:
             raise Refused(
                 "too much at once: your share of the relay's processor is used up; try again in a moment"
             )
 
     @contextmanager
     def counted(self) -> Iterator[None]:
-        """Around work for the client that is done later than its message is handled.
+        """Around work that is done for the client after its message was handled.
 
-        :raises Refused: the user has used up his share of the processor
+        :raises Refused: the user's CPU quota is used up
         """
         self.check()
         with self.timed():
@@ -51,12 +53,12 @@ class SessionQuota:
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Around work that is done whatever is left of the share."""
+        """Around work that is done whether the quota is used up or not."""
         if self.counting:
             yield
             return
         self.counting = True
-        worked = self._session.allowance.worked
+        worked = self.user.worked
         began = worked()
         try:
             yield
@@ -64,31 +66,31 @@ class SessionQuota:
             self.counting = False
             self._spent(worked() - began)
 
-    async def own_turn(self) -> None:
-        """Wait for a turn of the reactor in which nobody else's answer is made, unless the message is still handled.
+    async def wait_for_turn(self) -> None:
+        """Wait for a reactor turn in which no other answer is made, unless the message is still being handled.
 
-        Many may wait for the same word of a robot; it must not take all of their work at once.
+        Many clients may wait for the same answer of a robot; their work must not be done all at once.
         """
         if not self.counting:
-            await self._session.channel.line.turn()
+            await self._fair_queue.wait()
 
-    def took(self, seconds: float) -> None:
-        """Work for the client was done by another thread, for so long."""
+    def count_elsewhere(self, seconds: float) -> None:
+        """Count work that another thread did for the client."""
         self._spent(seconds)
 
-    def refused(self) -> None:
-        """Something was refused, which is not timed: that would take longer."""
+    def count_refusal(self) -> None:
+        """Count a refusal, which is not timed, as timing it would take longer."""
         self._spent(REFUSAL)
 
-    def asks_robot(self) -> None:
-        """A question goes to the robot: what its way there and back takes is counted."""
+    def count_robot_request(self) -> None:
+        """Count a request to the robot: the work to send it and to pass on its answer."""
         self._spent(ROUND_TRIP)
 
     def _spent(self, work: float) -> None:
-        requests = self._session.allowance.requests
+        requests = self.user.requests
         requests.spend(work)
         if requests.left < -DEBT:
-            self._session.close(
+            self.close(
                 close_codes.TOO_MANY_ERRORS,
                 "far too much at once: more than the relay can do beside its work",
             )

@@ -1,158 +1,145 @@
-"""What a client listens to: topics of the robot, and those of the relay itself."""
+"""Subscriptions of a client: to topics of the robot, and to the relay's own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Refused
-from relay_protocol.rights import Operation, Verdict
+from relay_protocol.rights import Decision, Operation
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.access import may_subscribe
 from relay_server.channels import encodings
 from relay_server.channels.client_subscription import ClientSubscription
-from relay_server.channels.robot_link import resolve
+from relay_server.channels.names import normal_type, resolve
 from relay_server.channels.samples import Converter, Sample
-from relay_server.common.clock import Clock
-from relay_server.common.timers import PeriodicTimer, PeriodicTimers
-from relay_server.sessions.type_names import normal_type
-
-if TYPE_CHECKING:
-    from relay_server.sessions.ports import LocalNode
-    from relay_server.sessions.session import Session
+from relay_server.common.clock import Clock, PeriodicTimer, PeriodicTimers
+from relay_server.sessions.context import ClientContext, LocalNode
 
 SUBSCRIPTIONS = 1024
-"""Topics one connection may have subscribed."""
+"""Most topics that are subscribed on one connection."""
 
-TELL_SECONDS = 1.0
-"""How often the relay publishes its own topics."""
+OWN_TOPICS_SECONDS = 1.0
+"""Seconds between messages of the relay's own topics."""
 
-_OWN = Converter(TypeRegistry(), "", "json", lambda reason: None)
-"""For what the relay itself says, which is JSON."""
+_JSON = Converter(TypeRegistry(), "", "json", lambda reason: None)
+"""Converter of the relay's own topics, whose messages are JSON."""
 
 
 class SubscriptionHandler:
     """The subscriptions of one session."""
 
-    def __init__(self, session: Session, clock: Clock, local: LocalNode, rounds: PeriodicTimers) -> None:
-        self._session = session
+    def __init__(self, client: ClientContext, clock: Clock, local: LocalNode, timers: PeriodicTimers) -> None:
+        self._client = client
         self._clock = clock
         self._local = local
-        self._listeners: dict[str, ClientSubscription] = {}
-        self._rounds = rounds
-        self._telling: PeriodicTimer | None = None
+        self._subscriptions: dict[str, ClientSubscription] = {}
+        self._timers = timers
+        self._own_timer: PeriodicTimer | None = None
 
     def end(self) -> None:
         """The client is gone."""
-        self._stop_telling()
-        for listener in self._listeners.values():
-            listener.close()
+        self._stop_own_timer()
+        for subscription in self._subscriptions.values():
+            subscription.close()
 
-    def subscribe(self, ask: rosbridge.Subscribe) -> None:
-        """One more subscription; several of one topic are merged."""
-        session = self._session
-        topic = resolve(ask.topic)
-        type_name = normal_type(ask.type)
-        verdict = self._judged(topic, type_name)
-        if not verdict.allowed:
-            raise Refused(verdict.reason)
-        form = encodings.asked(ask, session.tell, topic=True)
-        listener = self._listeners.get(topic)
-        if listener is None:
-            if len(self._listeners) >= SUBSCRIPTIONS:
+    def subscribe(self, operation: rosbridge.Subscribe) -> None:
+        """Subscribe to a topic; several subscriptions to one topic are merged."""
+        client = self._client
+        topic = resolve(operation.topic)
+        type_name = normal_type(operation.type)
+        decision = self._decide(topic, type_name)
+        if not decision.allowed:
+            raise Refused(decision.reason)
+        encoding = encodings.requested_encoding(operation, client.notify, topic=True)
+        subscription = self._subscriptions.get(topic)
+        if subscription is None:
+            if len(self._subscriptions) >= SUBSCRIPTIONS:
                 raise Refused(f"at most {SUBSCRIPTIONS} topics can be subscribed on one connection")
-            listener = ClientSubscription(self._clock, session, topic)
+            subscription = ClientSubscription(self._clock, client, topic)
         if self._local.topic(topic) is not None:
-            listener.add(ask, form)
-            self._listeners[topic] = listener
+            subscription.add(operation, encoding)
+            self._subscriptions[topic] = subscription
             if self._local.pushed(topic):
-                session.desk.pushing.follow(session, self._push)
-                self._push()
-            elif self._telling is None:
-                self._telling = PeriodicTimer(self._publish_local, TELL_SECONDS)
-                self._rounds.start(self._telling)
+                client.controller.changes.follow(client, self._publish_pushed)
+                self._publish_pushed()
+            elif self._own_timer is None:
+                self._own_timer = PeriodicTimer(self._publish_periodic, OWN_TOPICS_SECONDS)
+                self._timers.start(self._own_timer)
             return
-        subscriptions = session.channel.subscriptions
+        subscriptions = client.channel.subscriptions
         subscriptions.check(topic, type_name)
-        listener.add(ask, form)
-        subscriptions.add(session, listener, type_name, ask.qos)
-        self._listeners[topic] = listener
+        subscription.add(operation, encoding)
+        subscriptions.add(client, subscription, type_name, operation.qos)
+        self._subscriptions[topic] = subscription
 
-    def unsubscribe(self, ask: rosbridge.Unsubscribe) -> None:
-        """One subscription less, or none of a topic any more."""
-        topic = resolve(ask.topic)
-        listener = self._listeners.get(topic)
-        if listener is None:
+    def unsubscribe(self, operation: rosbridge.Unsubscribe) -> None:
+        """End one subscription, or all to a topic."""
+        topic = resolve(operation.topic)
+        subscription = self._subscriptions.get(topic)
+        if subscription is None:
             return
-        if ask.id is not None and listener.remove(ask.topic, ask.id):
+        if operation.id is not None and subscription.remove(operation.topic, operation.id):
             if self._local.topic(topic) is None:
-                self._session.channel.subscriptions.add(self._session, listener, None, None)
+                self._client.channel.subscriptions.add(self._client, subscription, None, None)
             return
-        self._drop(topic)
+        self._end(topic)
 
-    def hears(self, topic: str) -> bool:
-        """Whether a topic is subscribed, still."""
-        return topic in self._listeners
+    def is_subscribed(self, topic: str) -> bool:
+        """Whether a topic is still subscribed."""
+        return topic in self._subscriptions
 
-    def drops(self) -> dict[str, int]:
-        """Samples the client did not take in time, by topic."""
-        counted = self._session.outbox.drops
-        return {
-            topic: counted[listener] for topic, listener in self._listeners.items() if listener in counted
-        }
-
-    def lost(self) -> dict[str, Mapping[str, int]]:
-        """Samples of the subscribed topics that no client got, by topic and reason."""
-        subscriptions = self._session.channel.subscriptions
-        return {topic: subscriptions.losses(topic) for topic in self._listeners}
-
-    def judge_again(self) -> None:
-        """What the client may not hear any more ends: its rights have changed, or what the topics are."""
-        for topic in list(self._listeners):
-            verdict = self._judged(topic)
-            if not verdict.allowed:
-                ids = self._listeners[topic].ids
-                self._drop(topic)
+    def recheck_rights(self) -> None:
+        """End subscriptions that are no longer allowed, as rights or the types of topics have changed."""
+        for topic in list(self._subscriptions):
+            decision = self._decide(topic)
+            if not decision.allowed:
+                ids = self._subscriptions[topic].ids
+                self._end(topic)
                 for id in ids:
-                    self._session.tell("error", f"unsubscribed from {topic}: {verdict.reason}", id)
+                    self._client.notify("error", f"unsubscribed from {topic}: {decision.reason}", id)
 
-    def _judged(self, topic: str, type_name: str = "") -> Verdict:
-        session = self._session
+    def _decide(self, topic: str, type_name: str = "") -> Decision:
+        client = self._client
         if self._local.topic(topic) is not None:
-            return session.permit.judge(Operation.SUBSCRIBE, topic)
-        said = type_name or session.channel.subscriptions.type_for(session, topic)
-        return may_subscribe(session.permit.judge, session.robot, topic, [said] if said else ())
+            return client.permit.decide(Operation.SUBSCRIBE, topic)
+        named = type_name or client.channel.subscriptions.type_for(client, topic)
+        return may_subscribe(client.permit.decide, client.robot, topic, [named] if named else ())
 
-    def _drop(self, topic: str) -> None:
-        listener = self._listeners.pop(topic)
-        listener.close()
-        self._session.outbox.forget(listener)
-        self._session.channel.subscriptions.remove(self._session, topic)
+    def _end(self, topic: str) -> None:
+        subscription = self._subscriptions.pop(topic)
+        subscription.close()
+        self._client.port.forget(subscription)
+        self._client.channel.subscriptions.remove(self._client, topic)
 
-    def _publish_local(self) -> None:
-        if not self._tell(pushed=False):
-            self._stop_telling()
+    def _publish_periodic(self) -> None:
+        if not self._publish_own(pushed=False):
+            self._stop_own_timer()
 
-    def _push(self) -> None:
-        if not self._tell(pushed=True):
-            self._session.desk.pushing.forget(self._session)
-        elif self._session.desk.standing.stopped is not None:
-            # Who knows that the robot stands may let it move again at once.
-            self._session.ping()
+    def _publish_pushed(self) -> None:
+        if not self._publish_own(pushed=True):
+            self._client.controller.changes.forget(self._client)
+        elif self._client.controller.snapshot.stopped is not None:
+            # The pong proves that what the client sends next is newer than the stop, so it may resume at once.
+            self._client.port.ping()
 
-    def _tell(self, *, pushed: bool) -> bool:
-        """Publish the relay's own topics of one kind; whether any is subscribed."""
-        makers: list[tuple[str, Callable[[Session], dict[str, Any]] | None]] = [
-            (name, self._local.topic(name)) for name in self._listeners if self._local.pushed(name) is pushed
+    def _publish_own(self, *, pushed: bool) -> bool:
+        """Publish the relay's own topics of one kind; returns whether any is subscribed."""
+        makers: list[tuple[str, Callable[[ClientContext], dict[str, Any]] | None]] = [
+            (name, self._local.topic(name))
+            for name in self._subscriptions
+            if self._local.pushed(name) is pushed
         ]
         for name, make in makers:
             if make is not None:
-                body = jsontext.encode(make(self._session))
-                self._listeners[name].replay(Sample(body, 0, _OWN))
+                body = jsontext.encode(make(self._client))
+                subscription, sample = self._subscriptions[name], Sample(body, 0, _JSON)
+                # A throttle must not delay a change of control.
+                subscription.replay(sample) if pushed else subscription.receive(sample)
         return any(make for _, make in makers)
 
-    def _stop_telling(self) -> None:
-        if self._telling is not None:
-            self._telling.stop()
-            self._telling = None
+    def _stop_own_timer(self) -> None:
+        if self._own_timer is not None:
+            self._own_timer.stop()
+            self._own_timer = None

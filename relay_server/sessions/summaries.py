@@ -1,4 +1,4 @@
-"""What is told of robots: to users by their rights, to the administrator on the relay's own machine all of it."""
+"""Summaries of robots: for users by their rights, and complete for the administrator on the relay's own machine."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from relay_server.control import view
 from relay_server.control.controllers import Controllers
 from relay_server.robots.link_quality import LinkQuality, joined, milliseconds
 from relay_server.robots.registry import RobotRegistry, RobotState
-from relay_server.sessions.presence import PresenceReader, PresenceService, client_rows
-from relay_server.sessions.session import Session
+from relay_server.sessions.context import ClientContext
+from relay_server.sessions.presence import PresenceReader, PresenceService, RobotInfo, RobotUsers, client_rows
 
-FRESH_SECONDS = 0.25
-"""What passes without a change, such as the time to a robot and back, is so old at most in what pages show."""
+CACHE_SECONDS = 0.25
+"""Most seconds that a page's summary is reused. Values such as round-trip times change without an event."""
 
 
 class RobotSummaries:
-    """Puts together what is known of robots.
+    """Summaries of robots.
 
-    :param sessions: the open sessions of a robot by its id, oldest first
+    :param clients: the clients of a robot by its id, oldest first
     :param seconds: a monotonic clock
     """
 
@@ -34,81 +34,87 @@ class RobotSummaries:
         self,
         access: Access,
         registry: RobotRegistry,
-        people: PresenceService,
-        sessions: Callable[[int], list[Session]],
-        desks: Controllers,
+        presence: PresenceService,
+        clients: Callable[[int], list[ClientContext]],
+        controllers: Controllers,
         seconds: Callable[[], float],
     ) -> None:
         self._access = access
         self._registry = registry
-        self._people = people
-        self._sessions = sessions
-        self._desks = desks
+        self._presence = presence
+        self._clients = clients
+        self._controllers = controllers
         self._seconds = seconds
-        self._views: dict[tuple[object, ...], tuple[float, dict[str, Any]]] = {}
+        self._views: dict[tuple[object, ...], tuple[float, RobotInfo]] = {}
         registry.on_change(self._views.clear)
 
-    async def shared(self, principal: Principal) -> list[dict[str, Any]]:
-        """The same as :meth:`robots`, for pages: a row is shared by all users with equal rights on its robot.
+    async def shared(self, principal: Principal) -> list[RobotInfo]:
+        """As :meth:`robots`, for pages: users with equal rights on a robot share its summary.
 
-        It is made again when something has changed, and after :data:`FRESH_SECONDS`.
+        It is made again after a change, and after :data:`CACHE_SECONDS`.
         """
         return [self._shared(record, rules) for record, rules in await self._access.robots(principal)]
 
-    def _shared(self, record: queries.RobotRecord, rules: Rules) -> dict[str, Any]:
-        key = (record, rules.alike)
+    def _shared(self, record: queries.RobotRecord, rules: Rules) -> RobotInfo:
+        key = (record, rules.source_free_key)
         now = self._seconds()
-        at, row = self._views.get(key, (-math.inf, {}))
-        if now - at >= FRESH_SECONDS:
-            row = self._view(record, rules)
+        at, row = self._views.get(key, (-math.inf, None))
+        if row is None or now - at >= CACHE_SECONDS:
+            row = self._summary(record, rules)
             self._views[key] = now, row
         return row
 
-    async def robots(self, principal: Principal) -> list[dict[str, Any]]:
-        """What the principal may see of its robots."""
-        return [self._view(record, rules) for record, rules in await self._access.robots(principal)]
+    async def robots(self, principal: Principal) -> list[RobotInfo]:
+        """Summaries of the principal's robots, by its rights."""
+        return [self._summary(record, rules) for record, rules in await self._access.robots(principal)]
 
-    async def people(self, principal: Principal, robot: str) -> dict[str, Any]:
-        """Who is at a robot, and how good its link is (SPEC section 1.7).
+    async def people(self, principal: Principal, robot: str) -> RobotUsers:
+        """Users of a robot, and the quality of its link (SPEC 1.7).
 
         :raises NotFound: no such robot, or no right on it
         """
         for record, rules in await self._access.robots(principal):
             if record.name == robot:
-                there = self._of(record)
-                name = there.name_of(principal.name, principal.realm)
-                people, more = self._people.told(there, PresenceReader(name, rules, None))
+                robot_state = self._of(record)
+                name = robot_state.name_of(principal.name, principal.realm)
+                people, more = self._presence.users(robot_state, PresenceReader(name, rules, None))
                 return {
                     "robot": record.name,
-                    "state": there.state.value,
-                    "link": there.reading().told(),
-                    "drops": _drops(there),
-                    "battery": _battery(there),
+                    "state": robot_state.state.value,
+                    "link": robot_state.link_quality().summary(),
+                    "drops": _drops(robot_state),
+                    "battery": _battery(robot_state),
                     "people": people,
                     "more": more,
                 }
         raise NotFound(NO_ROBOT)
 
     def status(self) -> list[dict[str, Any]]:
-        """Every robot the relay knows and who works with it, for the administrator's own machine."""
-        return [self._known(robot) for robot in self._registry]
+        """Every robot the relay knows, with its clients, for the administrator's own machine."""
+        return [self._full_summary(robot) for robot in self._registry]
 
     def _of(self, record: queries.RobotRecord) -> RobotState:
-        return self._registry.find(record.id) or RobotState(record.id, record.name, record.realm)
+        known = self._registry.find(record.id)
+        if known is not None:
+            return known
+        elsewhere = self._registry.is_elsewhere(record.id)
+        return RobotState(record.id, record.name, record.realm, elsewhere=elsewhere)
 
-    def _view(self, record: queries.RobotRecord, rules: Rules) -> dict[str, Any]:
+    def _summary(self, record: queries.RobotRecord, rules: Rules) -> RobotInfo:
         robot = self._of(record)
-        link = robot.reading()
-        standing = self._desks.standing(record.id)
+        link = robot.link_quality()
+        snapshot = self._controllers.snapshot(record.id)
+        # Only robots with a right are listed.
+        assert rules.level is not None
         return {
             "name": record.name,
             "description": record.description,
             "state": robot.state.value,
-            "level": str(rules.level),
-            "clients": client_rows(robot, self._sessions(record.id), rules),
-            "people": self._people.count(robot, rules),
-            "holder": view.holder(standing),
-            "stopped": view.stopped(standing),
+            "level": rules.level,
+            "clients": client_rows(robot, self._clients(record.id), rules),
+            "people": self._presence.count(robot, rules),
+            "holder": view.holder(snapshot),
+            "stopped": view.stopped(snapshot),
             **view.overrides(robot, rules),
             "battery": _battery(robot),
             "rtt_ms": milliseconds(link.rtt),
@@ -119,63 +125,64 @@ class RobotSummaries:
             "last_seen": robot.last_seen,
         }
 
-    def _known(self, robot: RobotState) -> dict[str, Any]:
+    def _full_summary(self, robot: RobotState) -> dict[str, Any]:
         return {
             "name": robot.full,
             "realm": robot.realm,
             "shared": sorted(robot.shared),
             "state": robot.state.value,
+            "elsewhere": robot.elsewhere,
             "address": robot.address,
             "agent": robot.description.agent,
             "rtt_ms": milliseconds(robot.rtt),
-            "link": robot.reading().told(),
+            "link": robot.link_quality().summary(),
             "drops": _drops(robot),
             "battery": _battery(robot),
             "last_seen": robot.last_seen,
-            "health": None if robot.control is None else msgspec.structs.asdict(robot.health),
+            "health": None if robot.control_link is None else msgspec.structs.asdict(robot.health),
             "holder": self._holder(robot),
-            "stopped": view.stopped(self._desks.standing(robot.robot_id)),
+            "stopped": view.stopped(self._controllers.snapshot(robot.robot_id)),
             **view.overrides(robot),
-            "clients": [_client(each, robot.reading()) for each in self._sessions(robot.robot_id)],
-            "onlookers": [
+            "clients": [_client(each, robot.link_quality()) for each in self._clients(robot.robot_id)],
+            "viewers": [
                 {"user": each.name, "address": each.address, "since": since, "camera": each.camera}
-                for each, since in robot.onlookers.items()
+                for each, since in robot.viewers.items()
             ],
         }
 
     def _holder(self, robot: RobotState) -> dict[str, Any] | None:
-        tenure = self._desks.standing(robot.robot_id).lease.holder
-        if tenure is None:
+        holder = self._controllers.snapshot(robot.robot_id).lease.holder
+        if holder is None:
             return None
-        client = tenure.client
-        return {"user": client.name, "address": client.address, "since": tenure.since}
+        client = holder.client
+        return {"user": client.name, "address": client.address, "since": holder.since}
 
 
 def _drops(robot: RobotState) -> int | None:
-    """Samples the robot has dropped, as far as it has told."""
-    return None if robot.control is None else robot.health.dropped_samples
+    """Samples that the robot has reported as dropped."""
+    return None if robot.control_link is None else robot.health.dropped_samples
 
 
 def _battery(robot: RobotState) -> float | None:
-    """The charge it has, 0 to 1; what it had before it went away nobody shall take for that."""
-    return None if robot.control is None else robot.health.battery
+    """The charge, 0 to 1; ``None`` while the robot is offline."""
+    return None if robot.control_link is None else robot.health.battery
 
 
-def _client(session: Session, onward: LinkQuality) -> dict[str, Any]:
+def _client(client: ClientContext, robot_link: LinkQuality) -> dict[str, Any]:
     """A connection.
 
-    :param onward: how good the way from the relay to the robot is
+    :param robot_link: the quality of the link from the relay to the robot
     """
-    link = session.reading()
+    link = client.link_quality()
     return {
-        "user": session.name,
-        "address": session.address,
-        "since": session.since,
-        "rtt_ms": milliseconds(session.rtt),
-        "link": link.told(),
-        "robot_rtt_ms": milliseconds(joined(link, onward).rtt),
-        "drops": session.outbox.dropped,
-        "waiting_bytes": session.outbox.waiting_bytes,
-        "refusals": session.refusals,
-        "stale_commands": session.stale_commands,
+        "user": client.name,
+        "address": client.address,
+        "since": client.since,
+        "rtt_ms": milliseconds(client.rtt),
+        "link": link.summary(),
+        "robot_rtt_ms": milliseconds(joined(link, robot_link).rtt),
+        "drops": client.drops,
+        "waiting_bytes": client.port.waiting_bytes,
+        "refusals": client.refusals,
+        "stale_commands": client.stale_commands,
     }

@@ -1,4 +1,4 @@
-"""One viewer of one camera, from the desk that let him in until he leaves; and cameras as one may see them."""
+"""Viewers of cameras: their rights, their snapshots, and the facts about cameras that they may see."""
 
 from __future__ import annotations
 
@@ -6,43 +6,45 @@ from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 import msgspec
+from twisted.internet.defer import Deferred
 
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_protocol.rights import Operation
 from relay_server.access import Permit
 from relay_server.robots.registry import RobotState
+from relay_server.video.errors import NO_CAMERA
 from relay_server.video.frames import VideoFrameInfo
-from relay_server.video.ports import NO_CAMERA, differing
-from relay_server.video.stream import CameraStream
+from relay_server.video.stream import CameraStream, differing
 from relay_server.video.streams import CameraStreams
 
 
 class FrameSink(Protocol):
-    """What a viewer looks at: an answer over HTTP, a websocket."""
+    """Where a viewer's frames go: an HTTP response, a websocket."""
 
-    def picture(self, picture: VideoFrameInfo) -> None:
-        """There is a new picture."""
+    def frame_received(self, frame: VideoFrameInfo) -> None:
+        """A new frame."""
 
-    def playing(self, playing: link.Playing) -> None:
-        """What the robot sends from now on."""
+    def status_changed(self, playing: link.StreamStatus) -> None:
+        """The status of the stream, which holds from the next frame on."""
 
-    def instead(self, other: dict[str, Any]) -> None:
-        """What is shown from now on is not what was asked for but another form of the camera, because the robot is at
-        its limit. Told before the first picture, if it is so then, and whenever it changes.
+    def settings_differ(self, other: dict[str, Any]) -> None:
+        """The stream differs from the requested one, because the robot is at its limit.
 
-        :param other: the parameters by which it differs, as they are in it; none: it is what was asked for
+        Called before the first frame if it differs then, and at every change.
+
+        :param other: the parameters that differ, with their values in the stream; empty when nothing differs
         """
 
     def ended(self, error: SwitchboardError) -> None:
-        """There is nothing to see, or no more. Called once, and not after :meth:`CameraViewer.leave`."""
+        """The stream is not available, or no longer. Called once, and not after :meth:`CameraViewer.leave`."""
 
 
 def check_view(permit: Permit, camera: str, transport: str = "") -> None:
-    """Whether this may be seen.
+    """Check the right to view a camera.
 
-    :param transport: as in :class:`~relay_protocol.link.video.VideoSettings`; with it the robot may show another topic
-    :raises NotFound: no right to; said like that there is no such camera
+    :param transport: as in :class:`~relay_protocol.link.video.VideoSettings`; it may name another topic
+    :raises NotFound: no right; worded as if there were no such camera
     """
     if not _may_view(permit, camera, transport):
         raise NotFound(NO_CAMERA)
@@ -50,15 +52,15 @@ def check_view(permit: Permit, camera: str, transport: str = "") -> None:
 
 def _may_view(permit: Permit, camera: str, transport: str) -> bool:
     shown = {"compressed": link.compressed_of, "raw": link.raw_of}.get(transport, str)(camera)
-    return all(permit.judge(Operation.VIEW, each).allowed for each in {camera, shown})
+    return all(permit.decide(Operation.VIEW, each).allowed for each in {camera, shown})
 
 
 class CameraViewer:
-    """A viewer, as a stream has him. His right is judged again whenever rights change.
+    """A viewer of a stream. Its right is judged again whenever rights change.
 
-    :param permit: kept till the end, then given to ``over`` with all the rest
-    :param over: called once, when nothing is watched any more
-    :param snapshot: for one picture
+    :param permit: held until the end, then handed to ``on_end`` with the viewer
+    :param on_end: called once, when nothing is watched any more
+    :param snapshot: whether it is for one image
     """
 
     def __init__(
@@ -67,10 +69,10 @@ class CameraViewer:
         robot: RobotState,
         camera: str,
         settings: link.VideoSettings,
-        screen: FrameSink,
+        sink: FrameSink,
         *,
         address: str,
-        over: Callable[[CameraViewer], None],
+        on_end: Callable[[CameraViewer], None],
         snapshot: bool = False,
     ) -> None:
         self.permit = permit
@@ -79,77 +81,73 @@ class CameraViewer:
         self.settings = settings
         self.address = address
         self.snapshot = snapshot
-        self.pictures = 0
-        """How many there were for this viewer."""
-        self._screen = screen
-        self._over = over
+        self.frames = 0
+        """Frames shown to this viewer."""
+        self._sink = sink
+        self._on_end = on_end
         self._stream: CameraStream | None = None
         permit.on_change = self._rights_changed
         permit.on_revoke = self.end
 
     @property
     def user(self) -> int:
-        """Whose it is."""
+        """The user's number."""
         return self.permit.principal.user_id
 
     @property
     def name(self) -> str:
-        """What the user is called at this robot."""
+        """The user's name at this robot."""
         return self.robot.name_of(self.permit.principal.name, self.permit.principal.realm)
 
     @property
-    def about(self) -> dict[str, Any]:
-        """What is told of it in the journal."""
+    def event_data(self) -> dict[str, Any]:
+        """The data of its events."""
         return {"camera": self.camera, **({"snapshot": True} if self.snapshot else {})}
 
-    def begin(self, videos: CameraStreams) -> None:
-        """Watch.
+    def start(self, streams: CameraStreams) -> None:
+        """Start watching.
 
-        :raises NotFound: without the right to
-        :raises Unavailable: too many do
+        :raises NotFound: no right to view the camera
+        :raises Unavailable: there are too many viewers
         """
         check_view(self.permit, self.camera, self.settings.transport)
-        stream = videos.watch(self.robot, self.camera, self.settings, self, newest=True)
+        stream = streams.watch(self.robot, self.camera, self.settings, self, newest=True)
         self._stream = stream
         if stream.settings != self.settings:
-            self._screen.instead(differing(self.settings, stream.settings))
+            self._sink.settings_differ(differing(self.settings, stream.settings))
 
-    def start_anew(self) -> None:
-        """A picture of H.264 was left out: show nothing before the next one that stands alone."""
+    def request_keyframe(self) -> None:
+        """A frame of H.264 was dropped: show nothing before the next key frame."""
         if self._stream is not None:
-            self._stream.start_anew(self)
+            self._stream.request_keyframe(self)
 
     def leave(self) -> None:
-        """The viewer wants no more; a second time does nothing."""
+        """Stop watching. A second call does nothing."""
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.detach(self)
-            self._over(self)
+            self._on_end(self)
 
     def end(self, error: SwitchboardError) -> None:
-        """There is no more for him to see, and he is told why."""
+        """Stop watching, and give the viewer the reason."""
         if self._stream is not None:
             self.leave()
-            self._screen.ended(error)
+            self._sink.ended(error)
 
-    # --- Viewer -------------------------------------------------------------------------------------------
+    # --- ViewerPort ----------------------------------------------------------------------------------------
 
-    def picture(self, picture: VideoFrameInfo) -> None:
-        """From the stream."""
-        self.pictures += 1
-        self._screen.picture(picture)
+    def frame_received(self, frame: VideoFrameInfo) -> None:
+        self.frames += 1
+        self._sink.frame_received(frame)
 
-    def playing(self, playing: link.Playing) -> None:
-        """From the stream."""
-        self._screen.playing(playing)
+    def status_changed(self, playing: link.StreamStatus) -> None:
+        self._sink.status_changed(playing)
 
     def moved(self, stream: CameraStream) -> None:
-        """To another stream."""
         self._stream = stream
-        self._screen.instead(differing(self.settings, stream.settings))
+        self._sink.settings_differ(differing(self.settings, stream.settings))
 
     def ended(self, error: SwitchboardError) -> None:
-        """Detached by the stream."""
         self.end(error)
 
     # --- rights -------------------------------------------------------------------------------------------
@@ -159,8 +157,8 @@ class CameraViewer:
             self.end(Refused(f"your right to view {self.camera} was revoked"))
 
 
-def view(camera: link.Camera, streams: Iterable[CameraStream]) -> dict[str, Any]:
-    """A camera as users see it (SPEC section 1.8)."""
+def camera_info(camera: link.Camera, streams: Iterable[CameraStream]) -> dict[str, Any]:
+    """A camera as users see it (SPEC 1.8)."""
     return {
         "name": camera.name,
         "type": camera.type,
@@ -169,15 +167,43 @@ def view(camera: link.Camera, streams: Iterable[CameraStream]) -> dict[str, Any]
         "height": camera.height or None,
         "fps": camera.fps or None,
         "seen": camera.seen or None,
-        "streams": [_shown(stream) for stream in streams if stream.camera == camera.name],
+        "streams": [_stream_info(stream) for stream in streams if stream.camera == camera.name],
     }
 
 
-def _shown(stream: CameraStream) -> dict[str, Any]:
-    playing = stream.told or stream.failed
+def _stream_info(stream: CameraStream) -> dict[str, Any]:
+    playing = stream.status or stream.last_status
     return {
         "viewers": len(stream.viewers),
         "state": stream.state.name.lower(),
         "settings": msgspec.structs.asdict(stream.settings),
-        "playing": None if playing is None else msgspec.structs.asdict(playing),
+        "stream_status": None if playing is None else msgspec.structs.asdict(playing),
     }
+
+
+class Snapshot:
+    def __init__(self, seconds: Callable[[], float]) -> None:
+        self._seconds = seconds
+        self.other: dict[str, Any] = {}
+        """Waits for the first frame; the stream decides how long.
+
+        :param seconds: the monotonic clock of ``good_until``
+        """
+        self.done: Deferred[VideoFrameInfo] = Deferred()
+        """The parameters that differ from the requested ones."""
+
+    def frame_received(self, frame: VideoFrameInfo) -> None:
+        """The frame; fails when there is none."""
+        if not self.done.called and self._seconds() <= frame.good_until:
+            self.done.callback(frame)
+
+    def status_changed(self, playing: link.StreamStatus) -> None:
+        """Takes the first frame that is not old."""
+
+    def settings_differ(self, other: dict[str, Any]) -> None:
+        """Ignored: the frame has headers with its own parameters."""
+        self.other = other
+
+    def ended(self, error: SwitchboardError) -> None:
+        if not self.done.called:
+            self.done.errback(error)

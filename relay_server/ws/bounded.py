@@ -1,6 +1,6 @@
-"""A websocket that takes no more memory and time than it must, whatever the client sends or does not take.
+"""Websocket with bounded memory and time, whatever the client sends or does not read.
 
-Autobahn speaks RFC 6455; here is what it leaves open or does otherwise.
+Autobahn implements RFC 6455; :class:`BoundedProtocol` adds bounds, and an orderly end of the connection.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from autobahn.websocket.utf8validator import Utf8Validator
 from twisted.internet.protocol import connectionDone
 from twisted.internet.tcp import Server
 
+from relay_server.common import close_codes
 from relay_server.common.clock import Clock, Timer, cancel
-from relay_server.common.push_producer import PushProducer
 from relay_server.common.socket_writer import FlushScheduler, TransportWriter, writer_for
-from relay_server.common.tcp import tcp_of
+from relay_server.common.tcp import PushProducer, tcp_of
 from relay_server.ws.fast_receive import FastProtocol
 
 HANDSHAKE_ATTRIBUTES = (
@@ -29,134 +29,157 @@ HANDSHAKE_ATTRIBUTES = (
     "http_response_data",
     "http_status_line",
     "utf8validator",
+    "_transport_details",
+    "_wskey",
+    "websocket_extensions",
+    "websocket_origin",
+    "websocket_protocols",
 )
-"""Attributes of Autobahn that an open websocket does not need; its validator is made again for the first fragment."""
+"""Attributes of Autobahn that an open websocket does not need. The first fragment makes a validator again."""
 
-PIECES = 16_384
-"""Frames of one message, and chunks they came in: also the empty ones take memory."""
+MAX_PIECES = 16_384
+"""Most frames of one message, and chunks of frames, together; empty ones take memory too."""
 
-LEAVING_SECONDS = 2.0
-"""What was sent before the end has so long to go out; a client that takes nothing would stay for ever."""
+CLOSE_SECONDS = 2.0
+"""Seconds until a closed connection is aborted if the client has not read what was sent."""
+
+SLOW_CLOSE_SECONDS = 20.0
+"""The same for a client that was closed because it reads nothing: only when it reads again it can learn why."""
 
 REASON_BYTES = 123
-"""Room for words in a close frame (RFC 6455 section 5.5.1)."""
+"""Most bytes of the reason in a close frame (RFC 6455 section 5.5.1)."""
 
 
-class Shared(Protocol):
-    """What the websockets of one listening port have in common."""
+class BoundedFactory(Protocol):
+    """The factory: what the websockets of one listening port share."""
 
     clock: Clock
-    turns: FlushScheduler
+    flushes: FlushScheduler
     traffic: TrafficStats
 
 
 class BoundedProtocol(FastProtocol):
-    """See the module's text. How large a message may be is for the subclass to say."""
+    """A websocket with bounds; the subclass sets the largest message."""
 
-    factory: Shared
+    factory: BoundedFactory
     _writer: TransportWriter
 
     def __init__(self) -> None:
         super().__init__()
-        self._leaving: Timer | None = None
-        self._full = False
-        self._unanswered: bytes | None = None
+        self._abort_timer: Timer | None = None
+        self._buffer_full = False
+        self._pending_ping: bytes | None = None
+
+    def sendHttpErrorResponse(
+        self, code: int, reason: str, responseHeaders: list[tuple[str, str]] | None = None
+    ) -> None:
+        """Refuse the handshake. Reasons may quote the request, so only printable characters reach the status line."""
+        printable = "".join(each if each.isprintable() else "?" for each in reason)
+        super().sendHttpErrorResponse(code, printable, responseHeaders)
 
     @functools.cached_property
     def utf8validator(self) -> Utf8Validator:
-        """The state of a fragmented text message; most connections never send one."""
+        """Made for the first fragmented text message; most connections never send one."""
         return Utf8Validator()
 
     def connectionMade(self) -> None:
-        """The site has handed over a connection that asked to become a websocket."""
-        self._writer = writer_for(self.transport, self.factory.turns)
+        """The site has passed on a connection that requested a websocket."""
+        self._writer = writer_for(self.transport, self.factory.flushes)
         super().connectionMade()
 
     def connectionLost(self, reason: Any = connectionDone) -> None:
         """The connection that began as an HTTP request is gone."""
-        cancel(self._leaving)
+        cancel(self._abort_timer)
         super().connectionLost(reason)
 
-    def take_at_most(self, size: int) -> None:
-        """A message may have so many bytes."""
+    def limit_message_size(self, size: int) -> None:
+        """Set the most bytes of a message."""
         self.maxFramePayloadSize = self.maxMessagePayloadSize = size
 
-    def begun(self) -> None:
-        """The handshake is done: what was for it is let go, and the transport's fullness is minded here."""
-        # Kilobytes for every client that nobody reads any more.
+    def handshake_done(self) -> None:
+        """Drop what only the handshake needed, and watch the transport's buffer from now on."""
+        # They take kilobytes for each client.
         for name in HANDSHAKE_ATTRIBUTES:
             self.__dict__.pop(name, None)
-        # Of these every connection has its own: figures nobody asks for, and a queue for writes that are held back
-        # (they go through the writer).
+        # A dictionary never shrinks, and the attributes of a session would have it grow to twice its size.
+        self.__dict__ = dict(self.__dict__)
+        # Autobahn makes both for each connection: figures that are not used, and a queue in place of which the writer
+        # is used.
         self.trafficStats = self.factory.traffic
         self.send_queue = None
-        # Twisted's HTTP channel was the producer of this transport until now, and its buffer was that of a stranger.
+        # Until now Twisted's HTTP channel was the producer, with the small buffer of an unauthenticated connection.
         tcp = tcp_of(self.transport)
         if tcp is not None:
             vars(tcp).pop("bufferSize", None)
         self.transport.unregisterProducer()
         self.transport.registerProducer(PushProducer(self), True)
 
-    # --- what comes ---------------------------------------------------------------------------------------
+    # --- receiving ----------------------------------------------------------------------------------------
 
     def onMessageFrameBegin(self, length: int) -> None:
-        """One more frame of a message."""
+        """A frame of a message begins."""
         super().onMessageFrameBegin(length)
         self._check_pieces()
 
     def onMessageFrameData(self, payload: bytes) -> None:
-        """One more piece of it."""
+        """A part of a frame has come."""
         super().onMessageFrameData(payload)
         self._check_pieces()
 
     def _check_pieces(self) -> None:
         pieces = len(self.message_data) + len(self.frame_data)
-        if pieces > PIECES and not self.failedByMe:
+        if pieces > MAX_PIECES and not self.failedByMe:
             self.wasMaxMessagePayloadSizeExceeded = True
-            self._max_message_size_exceeded(pieces, PIECES, f"a message came in more than {PIECES} pieces")
+            self._max_message_size_exceeded(
+                pieces, MAX_PIECES, f"a message came in more than {MAX_PIECES} pieces"
+            )
 
     def _invalid_payload(self, reason: str) -> bool:
-        """Fail the connection once a message, so that the client can answer the close frame.
+        """Fail the connection once for a message, so that the client can answer the close frame.
 
-        Autobahn finds the end of invalid text invalid too. It drops the connection for that, and the close frame with
-        it, if the kernel still holds unread bytes of the client.
+        Autobahn finds the end of invalid text invalid too, and then drops the connection. The close frame is lost with
+        it if the kernel still holds unread bytes of the client.
         """
         return bool(self.state == self.STATE_OPEN and super()._invalid_payload(reason))
 
     def onPing(self, payload: bytes) -> None:
-        """A ping of the client. One that takes nothing gets the latest answered when it does again.
+        """Answer a ping. While the buffer is full only the newest waits to be answered (RFC 6455 section 5.5.3).
 
-        RFC 6455 section 5.5.3 allows that; the answers to a flood of pings must not pile up here.
+        So answers to a flood of pings do not pile up here.
         """
-        if self._full:
-            self._unanswered = payload
+        if self._buffer_full:
+            self._pending_ping = payload
         else:
             super().onPing(payload)
 
     def pause(self) -> None:
         """The transport's buffer is full."""
-        self._full = True
+        self._buffer_full = True
 
     def resume(self) -> None:
         """The transport takes bytes again."""
-        self._full = False
-        unanswered, self._unanswered = self._unanswered, None
-        if unanswered is not None:
-            self.onPing(unanswered)
+        self._buffer_full = False
+        ping, self._pending_ping = self._pending_ping, None
+        if ping is not None:
+            self.onPing(ping)
 
-    # --- what goes ----------------------------------------------------------------------------------------
+    # --- sending ------------------------------------------------------------------------------------------
 
-    def nothing_more(self) -> None:
-        """Nothing may follow a close frame (RFC 6455 section 5.5.1): whoever writes past Autobahn must cease now."""
+    def stop_sending(self) -> None:
+        """Stop code that writes past Autobahn: nothing may follow a close frame (RFC 6455 section 5.5.1)."""
 
     def sendData(self, data: bytes, sync: bool = False, chopsize: int | None = None) -> None:
-        """What Autobahn itself sends, in order with what does not go through it: after the handshake control frames
-        only, which may go between the frames of a message (RFC 6455 section 5.4).
-        """
-        self._writer.urgent(data)
+        """Send bytes of Autobahn in order with those that are written past it.
 
-    def say_close(self, code: int, reason: str) -> None:
-        """Send a close frame, with as much of the reason as there is room for."""
+        After the handshake these are control frames, which may go between the frames of a message (RFC 6455 section
+        5.4).
+        """
+        self._writer.write_beyond_budget(data)
+
+    def send_close(self, code: int, reason: str) -> None:
+        """Send a close frame; the reason is cut to :data:`REASON_BYTES`."""
+        if code == close_codes.TOO_SLOW:
+            self.closeHandshakeTimeout = SLOW_CLOSE_SECONDS
         text = reason.encode()[:REASON_BYTES].decode(errors="ignore")
         # Autobahn's sendClose takes no code that RFC 6455 itself defines, such as 1001 and 1009.
         self.sendCloseFrame(code=code, reasonUtf8=text.encode(), isReply=False)
@@ -164,27 +187,27 @@ class BoundedProtocol(FastProtocol):
     def sendCloseFrame(
         self, code: int | None = None, reasonUtf8: bytes | None = None, isReply: bool = False
     ) -> None:
-        """Our close, or the answer to the client's."""
+        """Send a close frame, the relay's own or the answer to the client's."""
         super().sendCloseFrame(code, reasonUtf8, isReply)
-        self.nothing_more()
+        self.stop_sending()
 
     def dataReceived(self, data: bytes) -> None:
-        """Bytes. Nothing is read any more once the connection ends."""
-        if self._leaving is None:
+        """Read bytes unless the connection is being closed."""
+        if self._abort_timer is None:
             super().dataReceived(data)
 
     def _closeConnection(self, abort: bool = False) -> None:
-        self.nothing_more()
+        self.stop_sending()
         self._writer.flush()
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()
-        if abort or self._leaving is not None:
+        if abort or self._abort_timer is not None:
             super()._closeConnection(abort)
             return
-        self._leaving = self.factory.clock.callLater(LEAVING_SECONDS, self.transport.abortConnection)
+        self._abort_timer = self.factory.clock.callLater(CLOSE_SECONDS, self.transport.abortConnection)
         if type(self.transport) is Server and not self.transport.TLS:
-            # What the client still sends, as answers to pings, would have the kernel reset a connection that is closed
-            # both ways, and the close frame would be lost where the line is thin.
+            # Half-closed: were it closed both ways, the kernel would reset it for bytes that the client still sends,
+            # such as pongs, and on a slow link the close frame would be lost.
             self.transport.loseWriteConnection()
         else:
             super()._closeConnection(abort)

@@ -1,20 +1,26 @@
-"""Who may come in by websocket: by what credentials of the handshake, and what is said to whom may not."""
+"""Authentication of websockets: credentials in the handshake, and the answers to those that are refused."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Collection
+from typing import Any, Protocol
 
+from autobahn.twisted.resource import WebSocketResource
 from autobahn.websocket.types import ConnectionRequest
+from twisted.web.server import Request
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_server.access import BadCredentials, Principal
-from relay_server.auth.authenticator import TicketPurpose
+from relay_server.auth.authenticator import TicketPurpose, TooManyTries
 from relay_server.common import close_codes
 from relay_server.common.send_queue import SendQueue
-from relay_server.http.rate_limits import TooManyRequests, TooManyStreams
-from relay_server.sessions.manager import AuthorizedSession, ShuttingDown
+from relay_server.foxglove.messages import SUBPROTOCOLS as FOXGLOVE_SUBPROTOCOLS
+from relay_server.foxglove.options import StreamOptions
+from relay_server.http.limits import TooManyRequests, TooManyStreams
+from relay_server.http.problems import problem
+from relay_server.sessions.manager import Admission, ShuttingDown
 from relay_server.sessions.ports import ClientTransport
-from relay_server.video.ports import EncoderUnavailable
+from relay_server.video.errors import EncoderUnavailable
 
 HANDSHAKE_STATUS = {
     close_codes.INVALID: 400,
@@ -27,27 +33,34 @@ HANDSHAKE_STATUS = {
 """The HTTP status of a handshake that would close with this code."""
 
 
-class WebSocketSession(Protocol):
-    """What goes on over a websocket once somebody is in: a session, or pictures of a camera."""
+class WebSocketHandler(Protocol):
+    """Handles the messages of one authenticated websocket.
 
-    outbox: SendQueue
-    """Its ``write`` is set by the websocket."""
+    It is a :class:`~relay_server.sessions.rosbridge_port.RosbridgePort`, a :class:`BinaryHandler`, a viewer of a
+    camera (:mod:`relay_server.video.websocket`), or a page with live updates (:mod:`relay_server.ws.updates`).
+    """
+
+    send_queue: SendQueue
+    """The websocket sets its ``write``."""
 
     @property
-    def not_before(self) -> int:
-        """What comes now was not sent before this; monotonic nanoseconds."""
+    def earliest_sent(self) -> int:
+        """Earliest time at which a message that comes now can have been sent; monotonic nanoseconds.
+
+        See :class:`relay_server.sessions.message_age.MessageAge`.
+        """
 
     def start(self) -> None:
-        """The client is in."""
+        """The websocket is open."""
 
-    def message(self, payload: bytes, *, since: int | None = None) -> None:
+    def message(self, payload: bytes, *, earliest_sent: int | None = None) -> None:
         """One text message.
 
-        :param since: what :attr:`not_before` was when its first frame came
+        :param earliest_sent: what :attr:`earliest_sent` was when its first frame came
         """
 
     def ping(self) -> None:
-        """Send a ping now, by which what was sent is measured."""
+        """Send a ping now; its answer shows how fast the connection is."""
 
     def pong(self, payload: bytes) -> None:
         """The answer to a ping."""
@@ -62,71 +75,121 @@ class WebSocketSession(Protocol):
         """Close the websocket with a code, and end."""
 
     def end(self, *, orderly: bool = False) -> None:
-        """The websocket is gone, or goes.
+        """The websocket is closed, or is being closed.
 
         :param orderly: the client has closed it
         """
 
 
-class HandshakeAuth(Protocol):
-    """Who may come in; the composition root's."""
+class BinaryHandler(WebSocketHandler, Protocol):
+    """Handles binary messages, too: a :class:`~relay_server.foxglove.port.FoxglovePort`."""
 
-    accepting: bool
+    def binary_message(self, payload: bytes, *, earliest_sent: int) -> None:
+        """One binary message.
+
+        :param earliest_sent: what :attr:`earliest_sent` was when its first frame came
+        """
+
+
+class HandshakeAuth(Protocol):
+    """Authenticates clients of websockets; see :class:`relay_server.auth.service.AuthService`."""
 
     async def bearer(self, token: str) -> Principal:
         """The principal of an access token."""
 
-    async def ticket(self, ticket: str, asked: TicketPurpose) -> Principal:
+    async def ticket(self, ticket: str, purpose: TicketPurpose) -> Principal:
         """The principal of a single-use ticket."""
 
-    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
-        """The principal of a session cookie, ``None`` when there is no such cookie."""
+    async def url_token(self, token: str, address: str) -> Principal:
+        """The principal of a token in the URL of a Foxglove websocket."""
 
-    async def admit(self, principal: Principal, robot: str, address: str) -> AuthorizedSession:
-        """Find out whether the principal has any right on the robot.
+    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
+        """The principal of a session cookie; ``None``: there is no such cookie."""
+
+
+class HandshakeSessions(Protocol):
+    """Authorizes clients of websockets, and opens their sessions.
+
+    For robots it is the :class:`~relay_server.sessions.manager.SessionManager`.
+    """
+
+    accepting: bool
+    """False while the relay shuts down."""
+
+    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
+        """Authorize a principal that has any right on the robot.
 
         :raises NotFound: it has none, or there is no such robot
         """
 
-    def open(
-        self, admission: AuthorizedSession, transport: ClientTransport, opened_ns: int
-    ) -> WebSocketSession:
-        """Begin a session that was admitted."""
+    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> WebSocketHandler:
+        """Begin an authorized session."""
 
-    def turn_away(self, admission: AuthorizedSession) -> None:
-        """Somebody who was admitted left before a session began."""
+    def release(self, admission: Admission) -> None:
+        """The client left before its authorized session began."""
+
+
+class DialectSessions(HandshakeSessions, Protocol):
+    """Also opens sessions of clients that speak the Foxglove protocol."""
+
+    def open_foxglove(
+        self, admission: Admission, transport: ClientTransport, opened_ns: int, options: StreamOptions
+    ) -> BinaryHandler:
+        """Begin an authorized session."""
+
+
+def foxglove_subprotocol(protocols: Collection[str]) -> str | None:
+    """The Foxglove subprotocol to select of those that a client offers; ``None``: it offers none."""
+    return next((each for each in FOXGLOVE_SUBPROTOCOLS if each in protocols), None)
+
+
+def subprotocol(protocols: Collection[str]) -> str | None:
+    """The subprotocol to select of those that a client of rosbridge offers."""
+    bearer = _bearer(protocols)
+    return bearer or next((each for each in protocols if each.startswith("rosbridge")), None)
+
+
+def _bearer(protocols: Collection[str]) -> str | None:
+    return next((each for each in protocols if each.startswith("bearer.")), None)
 
 
 async def identify(
-    gate: HandshakeAuth, request: ConnectionRequest, asked: TicketPurpose
-) -> tuple[Principal | None, str | None]:
-    """The principal, if the handshake names one, and the subprotocol to answer with.
+    auth: HandshakeAuth, request: ConnectionRequest, purpose: TicketPurpose, address: str
+) -> Principal | None:
+    """The principal, if the handshake has credentials.
 
-    :param asked: what a ticket would have to be for
-    :raises SwitchboardError: what it names proves nobody, or can't be checked
+    :param purpose: what a ticket must be for
+    :param address: of the client
+    :raises SwitchboardError: the credentials are wrong, or can't be checked
     """
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
-    bearer = next((each for each in request.protocols if each.startswith("bearer.")), None)
-    ticket = request.params.get("ticket")
-    chosen = bearer or next((each for each in request.protocols if each.startswith("rosbridge")), None)
+    bearer = _bearer(request.protocols)
+    ticket, token_in_url = request.params.get("ticket"), request.params.get("token")
     if scheme.lower() == "bearer" and token:
-        return await gate.bearer(token.strip()), chosen
+        return await auth.bearer(token.strip())
     if bearer is not None:
-        return await gate.bearer(bearer.removeprefix("bearer.")), chosen
+        return await auth.bearer(bearer.removeprefix("bearer."))
     if ticket:
-        return await gate.ticket(ticket[0], asked), chosen
+        return await auth.ticket(ticket[0], purpose)
+    if token_in_url:
+        if foxglove_subprotocol(request.protocols) is None or purpose.video:
+            raise BadCredentials(
+                "a token in the URL opens only websockets of Foxglove: offer the subprotocol "
+                f"{FOXGLOVE_SUBPROTOCOLS[0]}, or send an access token in the Authorization header"
+            )
+        return await auth.url_token(token_in_url[0], address)
     headers = request.headers
     origin = request.origin or None
-    return await gate.cookie(headers.get("cookie", ""), origin, headers.get("host", "")), chosen
+    return await auth.cookie(headers.get("cookie", ""), origin, headers.get("host", ""))
 
 
 def code_of(error: SwitchboardError) -> int:
-    """The code a websocket closes with for this reason."""
+    """The close code for an error."""
     if isinstance(error, Invalid):
         return close_codes.INVALID
     if isinstance(error, BadCredentials):
         return close_codes.UNAUTHENTICATED
-    if isinstance(error, (TooManyRequests, TooManyStreams)):
+    if isinstance(error, (TooManyRequests, TooManyStreams, TooManyTries)):
         return close_codes.TOO_MANY_ERRORS
     if isinstance(error, NotFound):
         return close_codes.NOT_FOUND
@@ -140,5 +203,48 @@ def code_of(error: SwitchboardError) -> int:
 
 
 def status_of(error: SwitchboardError) -> int:
-    """The HTTP status of a handshake that is refused for this reason."""
+    """The HTTP status of a handshake that is refused with an error."""
     return HANDSHAKE_STATUS.get(code_of(error), 403)
+
+
+READ = frozenset(
+    {
+        b"authorization",
+        b"connection",
+        b"cookie",
+        b"host",
+        b"origin",
+        b"sec-websocket-extensions",
+        b"sec-websocket-key",
+        b"sec-websocket-protocol",
+        b"sec-websocket-version",
+        b"upgrade",
+    }
+)
+"""Header fields that Autobahn or the relay reads in a handshake."""
+
+
+class WebSocketUpgrade(WebSocketResource):
+    """Gives Autobahn only the header fields that are read, in ASCII.
+
+    Autobahn splits the header by ``str.splitlines``, for which more characters end a line than for HTTP (0x85, which
+    many letters have in UTF-8). So a value could become a field of its own.
+    """
+
+    def render(self, request: Request) -> Any:
+        """Pass the connection to Autobahn."""
+        headers = request.requestHeaders
+        if request.forwarded is not None and not self._factory.takes_forwarded:
+            return problem(request, 404, "This websocket is not forwarded; connect to the relay itself.")
+        for name, values in list(headers.getAllRawHeaders()):
+            if name.lower() in READ:
+                ascii_only = [each.decode("ascii", "replace").encode("ascii", "replace") for each in values]
+                headers.setRawHeaders(name, ascii_only)
+            else:
+                headers.removeHeader(name)
+        # Not in a header: Autobahn could read one out of what the client wrote.
+        self._factory.forwarded = request.forwarded
+        try:
+            return super().render(request)
+        finally:
+            self._factory.forwarded = None

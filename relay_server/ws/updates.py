@@ -1,7 +1,7 @@
-"""The page's stream over a websocket (``/api/v1/robots/stream``, SPEC section 1.7).
+"""Updates of a page over a websocket (``/api/v1/robots/stream``, SPEC 1.7).
 
-Browsers allow six connections to a host over HTTP/1.1, of all tabs together, and a stream of server-sent events holds
-one for ever; of websockets they allow hundreds. Who comes in, and how it is closed, is as for every client's websocket.
+Browsers allow six HTTP/1.1 connections to a host, for all tabs together, and a stream of server-sent events keeps one
+of them. They allow hundreds of websockets. Authentication and closing are as for every client's websocket.
 """
 
 from __future__ import annotations
@@ -19,23 +19,19 @@ from relay_server.access import BadCredentials, Principal
 from relay_server.auth.authenticator import TicketPurpose, session_token
 from relay_server.auth.origins import Origins
 from relay_server.common import close_codes, websocket_frames
-from relay_server.common.clock import Clock
+from relay_server.common.clock import Clock, PeriodicTimer, PeriodicTimers
 from relay_server.common.send_queue import SendQueue
-from relay_server.common.timers import PeriodicTimer, PeriodicTimers
-from relay_server.http.live_updates import STALL_SECONDS, LiveUpdates
-from relay_server.http.update_sources import Sources
+from relay_server.http.live_updates import STALL_SECONDS, LiveUpdates, Sources
 from relay_server.sessions.ports import ClientTransport, Timing
-from relay_server.ws.client import ClientFactory, ClientProtocol
+from relay_server.ws.connection import ClientConnection, ClientFactory
 from relay_server.ws.handshake import code_of
 
 MESSAGE_BYTES = 125
-"""A page has nothing to say: what is larger is not even read."""
+"""Largest message that is read. A page has nothing to send."""
 
 
-class UpdatesServices(Protocol):
-    """What is asked for; the composition root's."""
-
-    timing: Timing
+class UpdatesTokens(Protocol):
+    """Looks up access tokens; see :class:`relay_server.auth.service.AuthService`."""
 
     async def token(self, token: str) -> Principal:
         """The principal of a token."""
@@ -43,23 +39,32 @@ class UpdatesServices(Protocol):
 
 @dataclass(frozen=True)
 class TokenPrincipal(Principal):
-    """Somebody, with the token that proved it: it is asked again and again whether that still counts."""
+    """A principal with the token that proved it; the token is checked again and again."""
 
     token: str = field(default="", repr=False)
 
 
-class UpdatesGate:
-    """Who may come in: whoever proves who he is. A :class:`relay_server.ws.handshake.HandshakeAuth`.
+class UpdatesAuth:
+    """Authenticates users, and opens updates for each.
+
+    A :class:`relay_server.ws.handshake.HandshakeAuth` and a :class:`relay_server.ws.handshake.HandshakeSessions`.
 
     :param cookie: name of the session cookie
     """
 
     def __init__(
-        self, clock: Clock, desk: UpdatesServices, origins: Origins, cookie: str, sources: Sources
+        self,
+        clock: Clock,
+        tokens: UpdatesTokens,
+        timing: Timing,
+        origins: Origins,
+        cookie: str,
+        sources: Sources,
     ) -> None:
         self.accepting = True
         self.clock = clock
-        self.desk = desk
+        self.tokens = tokens
+        self.timing = timing
         self.sources = sources
         self.rounds = PeriodicTimers(clock)
         self._origins = origins
@@ -68,150 +73,161 @@ class UpdatesGate:
 
     async def bearer(self, token: str) -> Principal:
         """The principal of an access token."""
-        return TokenPrincipal(**vars(await self.desk.token(token)), token=token)
+        return TokenPrincipal(**vars(await self.tokens.token(token)), token=token)
 
-    async def ticket(self, ticket: str, asked: TicketPurpose) -> Principal:
-        """A ticket opens something of one robot."""
-        raise BadCredentials("a ticket opens a robot, and this is about all of them; send an access token")
+    async def ticket(self, ticket: str, purpose: TicketPurpose) -> Principal:
+        """Refuse: a ticket is for one robot."""
+        raise BadCredentials("a ticket is for one robot, and updates are about all; send an access token")
+
+    async def url_token(self, token: str, address: str) -> Principal:
+        """Refuse: a token in a URL is for one robot."""
+        raise BadCredentials(
+            "a token in a URL is for one robot, and updates are about all; send an access token"
+        )
 
     async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
-        """The principal of a session cookie, ``None`` when there is no such cookie."""
+        """The principal of a session cookie; ``None``: there is no such cookie."""
         token = session_token(self._origins, self._cookie, header, origin, host)
         return None if token is None else await self.bearer(token)
 
     async def admit(self, principal: Principal, robot: str, address: str) -> Any:
-        """Everybody may be told of his robots, though he has none. What this returns is for :meth:`open`."""
+        """Every user may follow their robots, even without any. :meth:`open` takes the result."""
         return principal
 
     def open(self, admission: Any, transport: ClientTransport, opened_ns: int) -> UpdatesClient:
-        """Begin to tell somebody who was admitted."""
+        """Begin to send updates to an authorized principal."""
         client = UpdatesClient(self, transport, admission.token, self._open.discard)
         self._open.add(client)
         return client
 
-    def turn_away(self, admission: Any) -> None:
-        """Nothing was taken for him."""
+    def release(self, admission: Any) -> None:
+        """Nothing to release."""
 
-    def say_goodbye(self, reason: str) -> None:
-        """Refuse newcomers and close what is open: the relay is going down."""
+    def shutdown(self, reason: str) -> None:
+        """The relay shuts down: refuse new clients, and close what is open."""
         self.accepting = False
+        self.close_all(reason)
+
+    def close_all(self, reason: str) -> None:
+        """Close the websockets of all pages, which may connect again."""
         for client in list(self._open):
             client.close(close_codes.GOING_AWAY, reason)
 
 
 class UpdatesClient:
-    """What goes on over one page's websocket.
+    """The websocket of one page.
 
-    :param token: whose page it is
-    :param ended: told when this is over
+    :param token: the access token of its user
+    :param ended: called when the websocket is closed
     """
 
     log = Logger()
-    not_before = 0
-    """A page commands nothing."""
+    earliest_sent = 0
+    """A page sends no commands, so the age of its messages does not matter."""
 
     def __init__(
         self,
-        gate: UpdatesGate,
+        auth: UpdatesAuth,
         transport: ClientTransport,
         token: str,
         ended: Callable[[UpdatesClient], None],
     ) -> None:
-        desk = gate.desk
-        self.outbox = SendQueue(transport.send, gate.clock.seconds, self.cut)
-        self.outbox.on_hold = self._held
-        self._clock = gate.clock
-        self._rounds = gate.rounds
-        self._timing = desk.timing
+        self.send_queue = SendQueue(transport.send, auth.clock.seconds, self.cut)
+        self.send_queue.on_window_full = self._window_full
+        self._clock = auth.clock
+        self._rounds = auth.rounds
+        self._timing = auth.timing
         self._transport = transport
         self._ended = ended
-        self._telling = LiveUpdates(gate.clock, self, lambda: desk.token(token), gate.sources)
+        self._updates = LiveUpdates(auth.clock, self, lambda: auth.tokens.token(token), auth.sources)
         self._running: Deferred[None] | None = None
         self._pinging = PeriodicTimer(self._ping, self._timing.client_ping)
-        self._heard_at = gate.clock.seconds()
+        self._last_pong = auth.clock.seconds()
         self._pings = 0
 
-    # --- Occupant -----------------------------------------------------------------------------------------
+    # --- WebSocketHandler ---------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Tell, from now on."""
+        """Begin to send updates."""
         self._rounds.start(self._pinging)
-        self._running = Deferred.fromCoroutine(self._telling.run())
+        self._running = Deferred.fromCoroutine(self._updates.run())
         self._running.addErrback(self._over)
 
-    def message(self, payload: bytes, *, since: int | None = None) -> None:
-        """There is nothing to say here."""
-        self.close(close_codes.INVALID, "say nothing here: what there is to tell is told unasked")
+    def message(self, payload: bytes, *, earliest_sent: int | None = None) -> None:
+        """Close: this websocket takes no messages."""
+        self.close(
+            close_codes.INVALID, "this websocket takes no messages; updates are sent without a request"
+        )
 
     def ping(self) -> None:
         """Send a ping now."""
         self._ping()
 
     def pong(self, payload: bytes) -> None:
-        """It is still there."""
-        self._heard_at = self._clock.seconds()
+        """The page is still connected."""
+        self._last_pong = self._clock.seconds()
 
     def pause(self) -> None:
         """The transport's buffer is full."""
-        self.outbox.pause()
+        self.send_queue.pause()
         if self._running is not None:
-            self._telling.pause()
+            self._updates.pause()
 
     def resume(self) -> None:
         """The transport takes bytes again."""
-        self.outbox.resume()
+        self.send_queue.resume()
         if self._running is not None:
-            self._telling.resume()
+            self._updates.resume()
 
     def close(self, code: int, reason: str) -> None:
-        """Close the websocket, and end."""
+        """Close the websocket and end the updates."""
         self._transport.close(code, reason)
         self.end()
 
     def end(self, *, orderly: bool = False) -> None:
-        """The websocket is gone, or goes."""
+        """End the updates; the websocket is closed or closing."""
         self._pinging.stop()
-        self.outbox.close()
+        self.send_queue.close()
         self._ended(self)
         running, self._running = self._running, None
         if running is not None:
             running.cancel()
 
-    def _held(self, held: bool) -> None:
-        """The connection is thin: what changes meanwhile is told as it is when there is room again."""
+    def _window_full(self, full: bool) -> None:
+        """Hold updates back while the send queue is full; then send the state of that moment."""
         if self._running is None:
             return
-        if held:
-            self._telling.wait()
+        if full:
+            self._updates.wait()
         else:
-            self._telling.resume()
+            self._updates.resume()
 
-    # --- Page ---------------------------------------------------------------------------------------------
+    # --- UpdateSink ---------------------------------------------------------------------------------------
 
-    def tell(self, event: str, body: bytes) -> None:
-        """One event."""
+    def send(self, event: str, body: bytes) -> None:
+        """Send one event."""
         head = b'{"event":"' + event.encode() + b'","data":'
-        self.outbox.control(websocket_frames.text_of(head, body, b"}"))
+        self.send_queue.send_reliable(websocket_frames.text_of(head, body, b"}"))
 
-    def moves(self) -> bool:
-        """A page that takes something is never paused for long: little is on its way to it."""
+    def made_progress(self) -> bool:
+        """Always false: few bytes are in flight, so a page that reads is never paused for long."""
         return False
 
     def cut(self) -> None:
-        """It takes nothing any more."""
-        self.close(close_codes.TOO_SLOW, f"for {STALL_SECONDS:g} s nothing was taken")
+        """Close: the page accepts no more bytes."""
+        self.close(close_codes.TOO_SLOW, f"nothing was accepted for {STALL_SECONDS:g} s")
 
     def _over(self, failure: Any) -> None:
         error = failure.value
         if isinstance(error, SwitchboardError):
             self.close(code_of(error), str(error))
         elif not isinstance(error, CancelledError):
-            self.log.failure("a page can't be told any more", failure)
-            self.close(close_codes.INTERNAL, "the relay failed; its log tells more")
+            self.log.failure("sending updates to a page failed", failure)
+            self.close(close_codes.INTERNAL, "the relay failed; see its log")
 
     def _ping(self) -> None:
-        """Keep the way open, and see whether somebody is there."""
-        silent = self._clock.seconds() - self._heard_at
+        """Send a ping, or close when the page has not answered for too long."""
+        silent = self._clock.seconds() - self._last_pong
         if silent > max(self._timing.client_ping * 3, self._timing.stall_limit):
             self.close(close_codes.TOO_SLOW, f"no answer to pings for {silent:.0f} s")
         else:
@@ -219,18 +235,20 @@ class UpdatesClient:
             self._transport.ping(self._pings.to_bytes(8, "big"))
 
 
-class UpdatesProtocol(ClientProtocol):
+class UpdatesProtocol(ClientConnection):
     """The websocket of one page."""
 
-    takes = MESSAGE_BYTES
+    message_limit = MESSAGE_BYTES
+    has_dialects = False
     is_stream = True
 
-    def _asked_for(self, request: ConnectionRequest) -> TicketPurpose:
-        # All robots: there is none of this name.
+    def _purpose_of(self, request: ConnectionRequest) -> TicketPurpose:
+        # The empty name stands for all robots: no robot has it.
         return TicketPurpose("")
 
 
 class UpdatesFactory(ClientFactory):
-    """Builds a :class:`UpdatesProtocol` for each websocket; its gate is a :class:`UpdatesGate`."""
+    """Builds an :class:`UpdatesProtocol` for each websocket; its auth and its sessions are one :class:`UpdatesAuth`."""
 
     protocol = UpdatesProtocol
+    takes_forwarded = False

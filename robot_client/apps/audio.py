@@ -1,4 +1,4 @@
-"""Where speech comes from: a file, the standard input, a microphone; as blocks of one form, each with its moment."""
+"""Sources of speech: a file, the standard input or a microphone, as blocks of one format with their times."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from typing import Any, NamedTuple
 
 import click
 
-from robot_client.apps.clock import now as since_start
+from relay_protocol.clocks import now as seconds_since_boot
 
 RATE = 16000
 """Samples per second: one channel, 16 bits, little endian."""
 
 BLOCK = 0.03
-"""Seconds of a block."""
+"""Duration of a block, seconds."""
 
-WAITED = BLOCK / 2
-"""Seconds that reading a block takes at least where it was not there already."""
+FRESH_SECONDS = BLOCK / 2
+"""Least time to read a block that was not buffered already, seconds."""
 
 SIZE = int(RATE * BLOCK) * 2
-"""Bytes of a block."""
+"""Size of a block, bytes."""
 
-AFTER = 0.6
-"""Seconds of silence behind a file, in which its last word is found to have ended."""
+TRAILING_SILENCE = 0.6
+"""Silence appended to a file, so that its last word is recognised as ended, seconds."""
 
-KEPT = 50
-"""Blocks that wait at most; of what waits longer the oldest are dropped."""
+MAX_BLOCKS = 50
+"""Most buffered blocks; the oldest are dropped."""
 
-MEMORY = 1000
-"""Blocks of which the one that was on its way shortest tells how late the others are: half a minute."""
+DELAY_BLOCKS = 1000
+"""Blocks over which the least delay is taken: half a minute."""
 
 
 class Block(NamedTuple):
-    """Sound.
+    """A block of sound.
 
     :ivar data: :data:`SIZE` bytes
-    :ivar at: seconds, suspends included, when it ended
+    :ivar at: seconds, including suspends, end of the block
     """
 
     data: bytes
@@ -49,20 +49,20 @@ class Block(NamedTuple):
 
 
 def from_file(path: Path, sleep: Callable[[float], None] = time.sleep) -> Iterator[bytes]:
-    """A WAV file, as fast as it was spoken.
+    """Read a WAV file in real time.
 
-    :raises click.ClickException: it is none, or has another form
+    :raises click.ClickException: not a WAV file, or another format
     """
     try:
         with wave.open(str(path), "rb") as file:
             form = (file.getnchannels(), file.getsampwidth(), file.getframerate())
             data = file.readframes(file.getnframes())
     except (OSError, EOFError, wave.Error) as error:
-        raise click.ClickException(f"{path} can't be read as WAV: {error}") from None
+        raise click.ClickException(f"cannot read {path} as WAV: {error}") from None
     if form != (1, 2, RATE):
-        told = f"{form[0]} channels, {form[1] * 8} bits, {form[2]} Hz"
-        raise click.ClickException(f"{path} has {told}; what is needed is 1 channel, 16 bits, {RATE} Hz")
-    return _paced(data + bytes(int(AFTER * RATE) * 2), sleep)
+        actual = f"{form[0]} channels, {form[1] * 8} bits, {form[2]} Hz"
+        raise click.ClickException(f"{path} has {actual}; it must have 1 channel, 16 bits, {RATE} Hz")
+    return _paced(data + bytes(int(TRAILING_SILENCE * RATE) * 2), sleep)
 
 
 def _paced(data: bytes, sleep: Callable[[float], None]) -> Iterator[bytes]:
@@ -73,9 +73,9 @@ def _paced(data: bytes, sleep: Callable[[float], None]) -> Iterator[bytes]:
 
 
 def from_stream(stream: RawIOBase) -> Iterator[bytes]:
-    """Raw samples, as they come; whoever writes them gives the pace.
+    """Read raw samples at the pace of the stream.
 
-    :param stream: without a buffer, whose lock a thread that waits for more would take into the end of the program
+    :param stream: unbuffered, because a buffer's lock held by a waiting thread would block the exit
     """
     data = b""
     while more := stream.read(SIZE - len(data)):
@@ -86,15 +86,15 @@ def from_stream(stream: RawIOBase) -> Iterator[bytes]:
 
 
 def from_microphone(device: str | None) -> Iterator[bytes]:
-    """What a microphone hears.
+    """Read a microphone.
 
-    :param device: its number or a part of its name; the usual one where none is said
-    :raises click.ClickException: there is none, or no ``sounddevice``
+    :param device: number or part of the name; ``None`` for the default
+    :raises click.ClickException: no microphone, or no ``sounddevice``
     """
     try:
         import sounddevice
     except (ImportError, OSError) as error:
-        words = "a microphone takes sounddevice: pip install sounddevice, and the library PortAudio"
+        words = "a microphone needs sounddevice (pip install sounddevice) and the library PortAudio"
         raise click.ClickException(f"{words} ({error}); without it: --wav FILE, or --pcm") from None
     chosen = int(device) if device is not None and device.isdigit() else device
     try:
@@ -103,7 +103,7 @@ def from_microphone(device: str | None) -> Iterator[bytes]:
         )
         stream.start()
     except (sounddevice.PortAudioError, ValueError) as error:
-        raise click.ClickException(f"the microphone can't be used: {error}") from None
+        raise click.ClickException(f"cannot use the microphone: {error}") from None
     return _recorded(stream)
 
 
@@ -114,56 +114,56 @@ def _recorded(stream: Any) -> Iterator[bytes]:
 
 
 class BlockTimes:
-    """When blocks ended, though they may come late and several at once.
+    """Computes when blocks ended, although they may arrive late and in bursts.
 
-    The block that was on its way shortest is taken to have come at once: by as much more are the others late.
+    The block with the least delay counts as undelayed; the others are late by the difference.
     """
 
     def __init__(self) -> None:
         self._number = 0
-        self._delays: deque[float] = deque(maxlen=MEMORY)
+        self._delays: deque[float] = deque(maxlen=DELAY_BLOCKS)
 
-    def of_next(self, now: float) -> float:
-        """When the next block ended, that has come now; seconds, suspends included."""
+    def next_time(self, now: float) -> float:
+        """End of the next block, which arrived now; seconds, including suspends."""
         self._number += 1
         self._delays.append(now - self._number * BLOCK)
         return self._number * BLOCK + min(self._delays)
 
 
 class AudioBuffer(threading.Thread):
-    """Takes blocks from a source as they come, and keeps the newest.
+    """Reads blocks from a source, and keeps the newest.
 
-    What lies ready at the start, as in a full pipe, is of nobody knows when: it is dropped, to the first block that had
-    to be waited for.
+    The time of data buffered before the start, as in a full pipe, is unknown. It is dropped, up to the first block that
+    had to be waited for.
 
-    :param source: blocks, when they come
-    :param clock: seconds, suspends included
-    :ivar broken: why the source ended, in words, where it did not just end
+    :param source: yields blocks in real time
+    :param clock: seconds, including suspends
+    :ivar error: why the source failed; empty at a normal end
     """
 
-    def __init__(self, source: Iterator[bytes], clock: Callable[[], float] = since_start) -> None:
+    def __init__(self, source: Iterator[bytes], clock: Callable[[], float] = seconds_since_boot) -> None:
         super().__init__(daemon=True)
-        self.broken = ""
+        self.error = ""
         self._source = source
         self._clock = clock
-        self._moments = BlockTimes()
-        self._blocks: deque[Block | None] = deque(maxlen=KEPT)
+        self._times = BlockTimes()
+        self._blocks: deque[Block | None] = deque(maxlen=MAX_BLOCKS)
         self._more = threading.Condition()
 
     def run(self) -> None:
-        """Take them all."""
+        """Read until the source ends."""
         try:
             for data, now in self._fresh():
-                self._add(Block(data, self._moments.of_next(now)))
+                self._add(Block(data, self._times.next_time(now)))
         except Exception as error:
-            self.broken = f"no more sound: {error}"
+            self.error = f"the sound source failed: {error}"
         self._add(None)
 
     def _fresh(self) -> Iterator[tuple[bytes, float]]:
         fresh, asked = False, self._clock()
         for data in self._source:
             now = self._clock()
-            fresh = fresh or now - asked >= WAITED
+            fresh = fresh or now - asked >= FRESH_SECONDS
             if fresh:
                 yield data, now
             asked = self._clock()
@@ -174,7 +174,7 @@ class AudioBuffer(threading.Thread):
             self._more.notify()
 
     def __iter__(self) -> Iterator[Block]:
-        """The blocks, until the source has ended."""
+        """Yields blocks until the source ends."""
         while True:
             with self._more:
                 self._more.wait_for(lambda: self._blocks)

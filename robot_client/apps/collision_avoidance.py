@@ -1,12 +1,11 @@
-"""Keeps a robot away from what is in its way, whoever drives it: ``python -m robot_client.apps.collision_avoidance``.
+"""Keeps a robot away from obstacles while others drive it: ``python -m robot_client.apps.collision_avoidance``.
 
-A program beside the driver, who goes on driving: it reads the scanner, and where something ahead comes near it
-suppresses the driver's commands, turns the robot away, moves it off, and gives it back. Nothing of that is in the
-driver's program. It is the behaviour *runaway* of R. Brooks's subsumption architecture, by suppression of an input as
-SOM4R has it.
+It reads the scanner. When an obstacle ahead is near, it suppresses the driver's commands, turns the robot away, moves
+it off, and ends the suppression. The driver's program is not involved. This is the behaviour *runaway* of R. Brooks's
+subsumption architecture, by suppression of an input as in SOM4R.
 
-Each ray pushes the robot away from what it met, with the inverse square of the distance; the sum is the force. It takes
-the right to subscribe to the scanner's topic, and to suppress that of the commands.
+Each ray exerts a repulsive force, with the inverse square of the distance; the sum decides. The program needs the
+rights to subscribe to the scanner's topic, and to suppress the topic of the commands.
 """
 
 from __future__ import annotations
@@ -19,36 +18,41 @@ from typing import Any, NamedTuple
 
 import click
 
-from robot_client.apps.clock import now as since_start
-from robot_client.apps.connection import LivenessCheck, Refused, RosbridgeConnection, in_words, token
-from robot_client.apps.driver import SILENT, STILL, VelocityCommand, twist
-from robot_client.apps.reconnect import Ending, run_connected
-from robot_client.apps.status_line import StatusLine
-from robot_client.numbers import Number
+from relay_protocol.clocks import now as seconds_since_boot
+from robot_client.apps.connection import (
+    LivenessMonitor,
+    Refused,
+    RosbridgeConnection,
+    access_token,
+    errors_as_click,
+)
+from robot_client.apps.driver import LOST_SECONDS, ZERO_VELOCITY, VelocityCommand, twist
+from robot_client.apps.program import ExitSignal, StatusLine, run_connected
+from robot_client.command_line import Number
 
-REACH = 1.5
-"""Metres beyond which nothing pushes."""
-NEAREST = 0.05
-"""Metres; what seems nearer pushes no harder."""
-FLAT = 4 / 3
+RANGE = 1.5
+"""Metres; farther obstacles exert no force."""
+MIN_DISTANCE = 0.05
+"""Metres; nearer obstacles exert the force of this distance."""
+WALL_FORCE = 4 / 3
 """The force of a flat wall at one metre: the integral of the cube of the cosine over half a circle."""
-BLIND = 0.5
-"""Seconds without a scan after which it lets go: it does not move what it can't see."""
-RENEW = 0.1
-"""Seconds between two suppressions, at most."""
+SCAN_TIMEOUT = 0.5
+"""Seconds without a scan after which the suppression ends."""
+RENEWAL_SECONDS = 0.1
+"""Seconds between two suppressions."""
 SUPPRESS_MS = 200
 SCANS, COMMANDS = "scans", "commands"
-"""By these the relay names what it refuses. Of a command alone, as to a robot that is away, it may be done again."""
-BEAT = 1.0
-"""Seconds from one question to the relay to the next."""
-FACING = math.cos(math.radians(60))
-"""Of the angle between heading and force from which the robot moves off."""
+"""Ids by which the relay reports refusals."""
+PING_SECONDS = 1.0
+"""Interval of pings to the relay."""
+FACING_AWAY = math.cos(math.radians(60))
+"""Cosine of the angle between heading and force at which the robot moves off."""
 
 
 class ScanReading(NamedTuple):
-    """One turn of the scanner.
+    """One laser scan.
 
-    :ivar ranges: metres by ray; what is no finite number met nothing
+    :ivar ranges: metres by ray; a value that is not finite means no obstacle
     :ivar begin: radians of the first ray from straight ahead, counter-clockwise
     :ivar step: radians from one ray to the next
     """
@@ -59,22 +63,22 @@ class ScanReading(NamedTuple):
 
 
 class Force(NamedTuple):
-    """What pushes the robot, ahead and to the left."""
+    """Repulsive force, ahead and to the left."""
 
     ahead: float
     left: float
 
     @property
     def strength(self) -> float:
-        """How hard, however it points."""
+        """Magnitude."""
         return math.hypot(self.ahead, self.left)
 
 
 class AvoidanceConfig(NamedTuple):
-    """How it behaves.
+    """Settings.
 
-    :ivar near: metres from a flat wall ahead at which it takes over
-    :ivar clear: metres from a flat wall at which it gives the robot back
+    :ivar near: metres from a flat wall ahead at which avoidance begins
+    :ivar clear: metres from a flat wall at which avoidance ends
     :ivar speed: metres per second at which it moves off
     :ivar turn: radians per second at which it turns away
     """
@@ -86,20 +90,20 @@ class AvoidanceConfig(NamedTuple):
 
 
 def repulsion(scan: ScanReading) -> Force:
-    """The sum of what all rays push."""
+    """The sum of the forces of all rays."""
     ahead = left = 0.0
     for number, distance in enumerate(scan.ranges):
-        if distance is None or not 0.0 < distance < REACH:  # NaN is not in between either
+        if distance is None or not 0.0 < distance < RANGE:  # NaN is not in between either
             continue
         angle = scan.begin + number * scan.step
-        push = scan.step / max(distance, NEAREST) ** 2
+        push = scan.step / max(distance, MIN_DISTANCE) ** 2
         ahead -= push * math.cos(angle)
         left -= push * math.sin(angle)
     return Force(ahead, left)
 
 
 class AvoidancePhase(enum.Enum):
-    """What it does."""
+    """What the avoidance does."""
 
     WATCHING = "watching"
     TURNING = "turning"
@@ -107,17 +111,17 @@ class AvoidancePhase(enum.Enum):
 
 
 class CollisionAvoidance:
-    """Decides; pure."""
+    """Decides the motion from scans."""
 
-    def __init__(self, manners: AvoidanceConfig) -> None:
+    def __init__(self, config: AvoidanceConfig) -> None:
         self.phase = AvoidancePhase.WATCHING
-        self._manners = manners
-        self._near = FLAT / manners.near**2
-        self._clear = FLAT / manners.clear**2
+        self._config = config
+        self._near = WALL_FORCE / config.near**2
+        self._clear = WALL_FORCE / config.clear**2
         self._side = 1.0
 
-    def see(self, scan: ScanReading) -> VelocityCommand | None:
-        """What the robot is to do now; ``None`` to leave it to its driver."""
+    def update(self, scan: ScanReading) -> VelocityCommand | None:
+        """The command for the robot; ``None`` to leave it to its driver."""
         force = repulsion(scan)
         if self.phase is AvoidancePhase.WATCHING and force.strength > self._near and force.ahead < 0:
             self.phase = AvoidancePhase.TURNING
@@ -125,57 +129,63 @@ class CollisionAvoidance:
             self._side = math.copysign(1.0, force.left)
         elif self.phase is not AvoidancePhase.WATCHING and force.strength < self._clear:
             self.phase = AvoidancePhase.WATCHING
-        if self.phase is AvoidancePhase.TURNING and force.ahead >= FACING * force.strength:
+        if self.phase is AvoidancePhase.TURNING and force.ahead >= FACING_AWAY * force.strength:
             self.phase = AvoidancePhase.LEAVING
         elif self.phase is AvoidancePhase.LEAVING and force.ahead < 0:
             self.phase = AvoidancePhase.TURNING
         return self._command()
 
-    def rest(self) -> None:
-        """Leave the robot to its driver, whatever was under way."""
+    def reset(self) -> None:
+        """Leave the robot to its driver."""
         self.phase = AvoidancePhase.WATCHING
 
     def _command(self) -> VelocityCommand | None:
         if self.phase is AvoidancePhase.WATCHING:
             return None
         if self.phase is AvoidancePhase.TURNING:
-            return VelocityCommand(0.0, self._side * self._manners.turn)
-        return VelocityCommand(self._manners.speed, 0.0)
+            return VelocityCommand(0.0, self._side * self._config.turn)
+        return VelocityCommand(self._config.speed, 0.0)
 
 
 class AvoidanceLink:
-    """What it says to the relay, and what it hears.
+    """Messages to and from the relay.
 
-    :param line: to the robot
+    :param connection: to the robot
     :param scan: topic of the scanner
     :param command: topic of the commands
-    :param clock: seconds, suspends included
+    :param clock: seconds, including suspends
     """
 
     def __init__(
-        self, line: RosbridgeConnection, scan: str, command: str, clock: Callable[[], float] = since_start
+        self,
+        connection: RosbridgeConnection,
+        scan: str,
+        command: str,
+        clock: Callable[[], float] = seconds_since_boot,
     ) -> None:
-        self._line = line
-        self._pulse = LivenessCheck(line, clock, BEAT, SILENT)
+        self._connection = connection
+        self._liveness = LivenessMonitor(connection, clock, PING_SECONDS, LOST_SECONDS)
         self._clock = clock
         self._command = command
         self._asked: set[str] = set()
         self._waiting = ""
-        self.has_it = False
-        """Whether the relay has said that the robot obeys this program."""
-        line.say(op="set_level", level="error")
-        line.say(op="advertise", id=COMMANDS, topic=command, type="geometry_msgs/msg/Twist")
-        line.say(op="subscribe", id=SCANS, topic=scan, type="sensor_msgs/msg/LaserScan", queue_length=1)
+        self.in_command = False
+        """Whether the relay has confirmed the suppression."""
+        connection.send(op="set_level", level="error")
+        connection.send(op="advertise", id=COMMANDS, topic=command, type="geometry_msgs/msg/Twist")
+        connection.send(
+            op="subscribe", id=SCANS, topic=scan, type="sensor_msgs/msg/LaserScan", queue_length=1
+        )
 
     def scan(self, seconds: float) -> ScanReading | None:
-        """The next scan that comes within this time.
+        """The next scan, or ``None`` if none arrives within ``seconds``.
 
         :raises Lost: the relay has not answered for long
-        :raises Refused: the relay says that it must not do what it does
+        :raises Refused: the relay refuses a scan subscription or a command
         """
         end = self._clock() + seconds
         while (left := end - self._clock()) > 0:
-            message = self._pulse.hear(left)
+            message = self._liveness.receive(left)
             if message is None:
                 return None
             if message["op"] == "service_response":
@@ -188,108 +198,108 @@ class AvoidanceLink:
         return None
 
     def suppress(self) -> None:
-        """Have the robot obey this program alone, for a moment; again to go on."""
+        """Start or renew the suppression of other commands."""
         self._waiting = self._ask(SUPPRESS_MS)
 
     def drive(self, command: VelocityCommand) -> None:
-        """One command, once the robot obeys."""
-        if self.has_it:
-            self._line.say(op="publish", topic=self._command, msg=twist(command))
+        """Send a command, once the suppression is confirmed."""
+        if self.in_command:
+            self._connection.send(op="publish", topic=self._command, msg=twist(command))
 
-    def give_back(self) -> None:
-        """Let go of the robot, which its driver moves again."""
-        self.drive(STILL)
-        self.has_it = False
+    def release_control(self) -> None:
+        """Stop, and end the suppression."""
+        self.drive(ZERO_VELOCITY)
+        self.in_command = False
         self._waiting = ""
         self._ask(0)
 
     def _ask(self, ms: int) -> str:
-        number = self._line.call("/relay/suppress", resource=self._command, ms=ms)
+        number = self._connection.call("/relay/suppress", resource=self._command, ms=ms)
         self._asked.add(number)
         return number
 
     def _answered(self, message: dict[str, Any]) -> None:
         number = message["id"]
         if number not in self._asked:
-            return  # of a question whether anybody is there
+            return  # the answer to a ping
         self._asked.discard(number)
         if not message["result"]:
             raise Refused(str(message["values"]))
         if number == self._waiting:
-            self.has_it = bool(message["values"]["success"])
+            self.in_command = bool(message["values"]["success"])
 
 
 class AvoidanceProgram:
-    """Sees, decides, drives.
+    """Reads scans, decides, and drives.
 
     :param scan: topic of the scanner
     :param command: topic of the commands
-    :param tell: takes what happens, in a few words
-    :param clock: seconds, suspends included
+    :param report: takes a short text about every change
+    :param clock: seconds, including suspends
     """
 
     def __init__(
         self,
         scan: str,
         command: str,
-        runaway: CollisionAvoidance,
-        tell: Callable[[str], None],
-        clock: Callable[[], float] = since_start,
+        avoidance: CollisionAvoidance,
+        report: Callable[[str], None],
+        clock: Callable[[], float] = seconds_since_boot,
     ) -> None:
         self._scan = scan
         self._command = command
-        self._runaway = runaway
-        self._tell = tell
+        self._avoidance = avoidance
+        self._report = report
         self._clock = clock
         self._link: AvoidanceLink
         self._wanted: VelocityCommand | None = None
         self._seen = self._asked = clock()
 
-    def begin(self, line: RosbridgeConnection) -> None:
-        """There is a line. Nothing of what was seen by another counts."""
-        self._link = AvoidanceLink(line, self._scan, self._command, self._clock)
-        self._runaway.rest()
+    def begin(self, connection: RosbridgeConnection) -> None:
+        """A connection was made; earlier scans do not count."""
+        self._link = AvoidanceLink(connection, self._scan, self._command, self._clock)
+        self._avoidance.reset()
         self._wanted = None
         self._seen = self._clock()
-        self._tell("READY")
+        self._report("READY")
 
     def step(self) -> bool:
-        """Take what comes within a moment, and act on it.
+        """Receive one message, and act on it.
 
         :raises robot_client.apps.connection.Lost: the relay has not answered for long
-        :raises robot_client.apps.connection.Refused: the relay says no, and will until a person has done something
+        :raises robot_client.apps.connection.Refused: the relay refuses, and a retry does not help
         """
-        scan = self._link.scan(RENEW / 2)
+        scan = self._link.scan(RENEWAL_SECONDS / 2)
         now = self._clock()
         if scan is not None:
             self._seen = now
-            self._follow(self._runaway.see(scan))
-        elif now - self._seen > BLIND:
-            self._runaway.rest()
+            self._follow(self._avoidance.update(scan))
+        elif now - self._seen > SCAN_TIMEOUT:
+            self._avoidance.reset()
             self._follow(None)
         if self._wanted is not None:
-            if now - self._asked >= RENEW:
+            if now - self._asked >= RENEWAL_SECONDS:
                 self._asked = now
                 self._link.suppress()
             self._link.drive(self._wanted)
         return True
 
     def leave(self) -> None:
-        """Let go of the robot, if it has it."""
+        """End a suppression."""
         self._follow(None)
 
     def lost(self, why: str, seconds: float) -> None:
-        """Say so. The robot was its driver's again within a moment."""
-        self._tell(f"{why}; again in {seconds:.1f} s")
+        """Report it. The suppression ends by itself."""
+        self._report(f"{why}; again in {seconds:.1f} s")
 
     def _follow(self, wanted: VelocityCommand | None) -> None:
         if wanted is None and self._wanted is not None:
-            # Before it is said: the line may break in saying it.
+            # Set before sending, because the connection may break.
             self._wanted = None
-            self._tell("clear: given back")
-            self._link.give_back()
+            self._report("clear: suppression ended")
+            self._link.release_control()
         elif wanted is not None and self._wanted is None:
-            self._tell("too near: turning away")
+            self._report("too near: turning away")
             self._asked = -math.inf
         self._wanted = wanted
 
@@ -303,10 +313,10 @@ class AvoidanceProgram:
     "--clear", type=Number(0.1, 1.5), default=AvoidanceConfig().clear, show_default=True, metavar="M"
 )
 def main(url: str, scan: str, command: str, near: float, clear: float) -> None:
-    """Keep the robot at URL (ws://relay/robots/NAME) away from what is in its way.
+    """Keep the robot at URL (ws://relay/robots/NAME) away from obstacles.
 
-    The token comes from the variable SWITCHBOARD_TOKEN. Prints READY when it watches, and connects anew when the
-    connection is lost. SIGINT and SIGTERM end it.
+    The access token is read from SWITCHBOARD_TOKEN. Prints READY when it watches, and reconnects when the connection
+    is lost. SIGINT and SIGTERM end the program.
 
     \b
     Examples:
@@ -316,15 +326,15 @@ def main(url: str, scan: str, command: str, near: float, clear: float) -> None:
     """
     if clear <= near:
         raise click.BadParameter(f"--clear ({clear:g}) must be more than --near ({near:g})")
-    token()
-    ending = Ending()
-    status = StatusLine(sys.stdout, since_start)
+    access_token()
+    exit_signal = ExitSignal()
+    status = StatusLine(sys.stdout, seconds_since_boot)
     program = AvoidanceProgram(
-        scan, command, CollisionAvoidance(AvoidanceConfig(near=near, clear=clear)), status.tell
+        scan, command, CollisionAvoidance(AvoidanceConfig(near=near, clear=clear)), status.show
     )
-    with in_words():
-        run_connected(url, program, ending)
-    status.end("ended")
+    with errors_as_click():
+        run_connected(url, program, exit_signal)
+    status.finish("ended")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What words mean to a robot, one after the other. Pure."""
+"""Turns spoken command words into velocity commands."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import NamedTuple
 from robot_client.apps.driver import MaximumSpeeds, VelocityCommand
 
 SECONDS = 1.5
-"""How long a word acts."""
+"""Duration of a word's motion, seconds."""
 
-FIRST = 0.5
-"""Of the fastest: how fast it goes before anybody has said anything of it."""
+INITIAL_FACTOR = 0.5
+"""Initial speed, as fraction of the maximum."""
 
-SLOWEST = 0.1
-STEP = 1.3
-"""How many times as fast it is after *faster*."""
+MIN_FACTOR = 0.1
+FACTOR_STEP = 1.3
+"""Factor of *faster* and *slower*."""
 
 
 class CommandWord(enum.Enum):
-    """All that are understood."""
+    """Recognised words."""
 
     RIGHT = "right"
     LEFT = "left"
@@ -36,59 +36,60 @@ class _WordMotion(NamedTuple):
     left: float
 
 
-_WAYS = {
+_MOTIONS = {
     CommandWord.AHEAD: _WordMotion(1.0, 0.0),
     CommandWord.BACK: _WordMotion(-1.0, 0.0),
     CommandWord.LEFT: _WordMotion(0.0, 1.0),
     CommandWord.RIGHT: _WordMotion(0.0, -1.0),
 }
 
-MOVES = frozenset(_WAYS)
-"""Words that make a robot move that stands."""
+MOTION_WORDS = frozenset(_MOTIONS)
+"""Words that start a motion."""
 
 
 class WordCommands:
-    """The word under way, and how fast it is done.
+    """The current motion and its speed.
 
-    :param seconds: how long a word acts; said again, or followed by *faster* or *slower*, it goes on from there
+    :param seconds: duration of a word's motion; the same word, *faster* and *slower* extend it
     """
 
     def __init__(self, seconds: float = SECONDS) -> None:
         self._seconds = seconds
-        self._part = FIRST
-        self._way: _WordMotion | None = None
+        self._speed_factor = INITIAL_FACTOR
+        self._motion: _WordMotion | None = None
         self._until = -math.inf
 
-    def say(self, word: CommandWord, now: float) -> None:
-        """A word was said.
+    def handle(self, word: CommandWord, now: float) -> None:
+        """Take a word.
 
         :param now: monotonic seconds
         """
         if word is CommandWord.STOP:
-            self.still()
-        elif word in _WAYS:
-            self._way, self._until = _WAYS[word], now + self._seconds
+            self.cancel()
+        elif word in _MOTIONS:
+            self._motion, self._until = _MOTIONS[word], now + self._seconds
         else:
-            self._part *= STEP if word is CommandWord.FASTER else 1 / STEP
-            self._part = min(1.0, max(SLOWEST, self._part))
-            if self.under_way(now):
+            self._speed_factor *= FACTOR_STEP if word is CommandWord.FASTER else 1 / FACTOR_STEP
+            self._speed_factor = min(1.0, max(MIN_FACTOR, self._speed_factor))
+            if self.active(now):
                 self._until = now + self._seconds
 
-    def still(self) -> None:
-        """Nothing is under way any more."""
-        self._way = None
+    def cancel(self) -> None:
+        """End the motion."""
+        self._motion = None
 
-    def under_way(self, now: float) -> bool:
-        """Whether a word still acts."""
-        return self._way is not None and now < self._until
+    def active(self, now: float) -> bool:
+        """Whether a motion is active."""
+        return self._motion is not None and now < self._until
 
     def command(self, top: MaximumSpeeds, now: float) -> VelocityCommand | None:
-        """What the robot is to do now; ``None`` to stand.
+        """The command for the robot; ``None`` to stop.
 
-        :param top: the fastest it may be
+        :param top: maximum speeds
         """
-        if self._way is None or now >= self._until:
+        if self._motion is None or now >= self._until:
             return None
         return VelocityCommand(
-            self._way.ahead * self._part * top.speed, self._way.left * self._part * top.turn
+            self._motion.ahead * self._speed_factor * top.speed,
+            self._motion.left * self._speed_factor * top.turn,
         )

@@ -1,4 +1,4 @@
-"""The way to a robot that all applications take: its websocket, with a token, and what is said there."""
+"""The websocket connection of an application to a robot."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ import click
 
 TOKEN = "SWITCHBOARD_TOKEN"  # noqa: S105 -- the name of the variable
 CLOSE_SECONDS = 2.0
-"""How long a relay that does not answer its goodbye is waited for."""
+"""Longest wait for the relay's close frame, seconds."""
 
-AGAIN = (429, 500, 502, 503, 504)
-"""Answers of HTTP that may be others in a while."""
+RETRYABLE_STATUS = (429, 500, 502, 503, 504)
+"""HTTP status codes after which a retry may succeed."""
 
-FINAL = (4400, 4401, 4403, 4404)
-"""Codes of closing that stay what they are until a person has done something (SPEC section 1.4)."""
+FINAL_CLOSE_CODES = (4400, 4401, 4403, 4404)
+"""Websocket close codes after which a retry does not help (SPEC 1.4)."""
 
 
 class Refused(Exception):
-    """The relay does not let it; the text says why."""
+    """The relay refuses, and a retry does not help. The text says why."""
 
 
 class Lost(Exception):
-    """There is no connection, or no longer; there may be one in a while. The text says why."""
+    """There is no connection; a retry may help. The text says why."""
 
 
 class RosbridgeConnection:
-    """Messages to a robot and from it.
+    """Sends and receives rosbridge messages of one robot.
 
     :param connection: a websocket of the ``websockets`` library
     """
@@ -40,94 +40,100 @@ class RosbridgeConnection:
         self._connection = connection
         self._numbers = itertools.count(1)
 
-    def say(self, **message: Any) -> None:
-        """One operation of rosbridge."""
+    def send(self, **message: Any) -> None:
+        """Send one rosbridge operation."""
         self._connection.send(json.dumps(message))
 
     def call(self, service: str, **args: Any) -> str:
-        """Call a service; the ``id`` its answer will have."""
+        """Call a service, and return the ``id`` of its answer."""
         number = str(next(self._numbers))
-        self.say(op="call_service", service=service, id=number, args=args)
+        self.send(op="call_service", service=service, id=number, args=args)
         return number
 
-    def hear(self, seconds: float) -> dict[str, Any] | None:
-        """The next message that comes within this time."""
+    def receive(self, seconds: float) -> dict[str, Any] | None:
+        """The next message, or ``None`` if none arrives within ``seconds``."""
         try:
             return dict(json.loads(self._connection.recv(timeout=seconds)))
         except TimeoutError:
             return None
 
 
-class LivenessCheck:
-    """Whether the relay still answers by a line. It is asked now and then, for a network may swallow all in silence.
+class LivenessMonitor:
+    """Checks by pings that the relay still answers, because a network can drop everything unnoticed.
 
-    :param line: to the robot
-    :param clock: seconds, suspends included
-    :param beat: seconds from one question to the next
-    :param silent: seconds without a word of the relay after which there is no connection
+    :param connection: to the robot
+    :param clock: seconds, including suspends
+    :param ping_seconds: interval of pings
+    :param lost_seconds: time without a message after which the connection counts as lost
     """
 
     def __init__(
-        self, line: RosbridgeConnection, clock: Callable[[], float], beat: float, silent: float
+        self,
+        connection: RosbridgeConnection,
+        clock: Callable[[], float],
+        ping_seconds: float,
+        lost_seconds: float,
     ) -> None:
-        self._line = line
+        self._connection = connection
         self._clock = clock
-        self._beat = beat
-        self._silent = silent
-        self._heard_at = self._asked_at = clock()
+        self._ping_seconds = ping_seconds
+        self._lost_seconds = lost_seconds
+        self._received_at = self._pinged_at = clock()
 
-    def hear(self, seconds: float) -> dict[str, Any] | None:
+    def receive(self, seconds: float) -> dict[str, Any] | None:
         """The next message that comes within this time.
 
-        :raises Lost: nothing has come for long
+        :raises Lost: nothing was received for ``lost_seconds``
         """
-        message = self._line.hear(seconds)
+        message = self._connection.receive(seconds)
         now = self._clock()
         if message is not None:
-            self._heard_at = now
-        if now - self._heard_at > self._silent:
-            raise Lost(f"the relay has not answered for {self._silent:g} s")
-        if now - self._asked_at >= self._beat:
-            self._asked_at = now
-            self._line.call("/relay/ping")
+            self._received_at = now
+        if now - self._received_at > self._lost_seconds:
+            raise Lost(f"the relay has not answered for {self._lost_seconds:g} s")
+        if now - self._pinged_at >= self._ping_seconds:
+            self._pinged_at = now
+            self._connection.call("/relay/ping")
         return message
 
 
-def token() -> str:
-    """What proves to the relay who this is.
+def access_token() -> str:
+    """The access token from the environment.
 
-    :raises click.ClickException: there is none
+    :raises click.ClickException: it is not set
     """
     found = os.environ.get(TOKEN, "")
     if not found:
-        raise click.ClickException(f"set {TOKEN}: switchboard token create USER")
+        raise click.ClickException(
+            f"set {TOKEN} to an access token; create one by: switchboard token create USER"
+        )
     return found
 
 
 @contextlib.contextmanager
 def connected(url: str) -> Iterator[RosbridgeConnection]:
-    """A line to a robot, closed in order at the end.
+    """A connection to a robot, closed at the end.
 
     :param url: ``ws://relay/robots/NAME``
-    :raises click.ClickException: there is no token
-    :raises Lost: it can't be made now, or broke
-    :raises Refused: the relay says no, and will until a person has done something
+    :raises click.ClickException: no access token is set
+    :raises Lost: it failed, and a retry may help
+    :raises Refused: the relay refuses, and a retry does not help
     """
     from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
     from websockets.sync.client import connect
 
-    headers = {"Authorization": f"Bearer {token()}"}
+    headers = {"Authorization": f"Bearer {access_token()}"}
     try:
-        with connect(url, additional_headers=headers, close_timeout=CLOSE_SECONDS) as connection:
-            yield RosbridgeConnection(connection)
+        with connect(url, additional_headers=headers, close_timeout=CLOSE_SECONDS) as websocket:
+            yield RosbridgeConnection(websocket)
     except InvalidURI as error:
-        raise Refused(f"{url} is no address of a robot: {error}") from None
+        raise Refused(f"{url} is not the address of a robot: {error}") from None
     except InvalidStatus as error:
         code = error.response.status_code
         words = f"the relay at {url} answers {code}{_meaning(code)}"
-        raise (Lost if code in AGAIN else Refused)(words) from None
+        raise (Lost if code in RETRYABLE_STATUS else Refused)(words) from None
     except ConnectionClosed as error:
-        final = error.rcvd is not None and error.rcvd.code in FINAL
+        final = error.rcvd is not None and error.rcvd.code in FINAL_CLOSE_CODES
         words = (error.rcvd.reason if error.rcvd is not None else "") or str(error)
         raise (Refused if final else Lost)(f"the connection to {url} is lost: {words}") from None
     except (OSError, InvalidHandshake) as error:
@@ -136,16 +142,16 @@ def connected(url: str) -> Iterator[RosbridgeConnection]:
 
 def _meaning(code: int) -> str:
     words = {
-        401: "the token is not good, or not any more",
-        403: "the token's user has no right on this robot",
-        404: "there is no such robot, or no right on it",
+        401: "the access token is not valid, or has expired",
+        403: "the user has no right on this robot",
+        404: "the robot does not exist, or the user has no right on it",
     }
     return f": {words[code]}" if code in words else ""
 
 
 @contextlib.contextmanager
-def in_words() -> Iterator[None]:
-    """What the way to the robot raises, as what a command says before it ends with 1."""
+def errors_as_click() -> Iterator[None]:
+    """Turn errors of a connection into error messages of the command, which exits with 1."""
     try:
         yield
     except (Lost, Refused) as error:

@@ -1,42 +1,43 @@
-"""Driving by one line: control taken and given back, the robot's limits, zero, stop. What joystick and voice share."""
+"""Drives a robot over one connection: control, speed limits, zero velocity, stop. All driving applications use it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 from robot_client.apps.connection import Lost, RosbridgeConnection
 
 TWIST = "geometry_msgs/msg/Twist"
-BEAT = 0.25
-"""Seconds from one look at how the robot is reached to the next."""
+PING_SECONDS = 0.25
+"""Interval of pings to the robot."""
 
-LATE = 1.0
-"""Seconds without an answer of the robot after which nobody should go on driving what he can't reach."""
+UNRESPONSIVE_SECONDS = 1.0
+"""Time without an answer of the robot after which driving ends."""
 
-SILENT = 6.0
-"""Seconds without an answer after which there is no connection, whatever the system says."""
+LOST_SECONDS = 6.0
+"""Time without an answer after which the connection counts as lost."""
 
 
 class VelocityCommand(NamedTuple):
-    """Metres per second ahead and radians per second counter-clockwise."""
+    """Forward speed in m/s and turn rate in rad/s, counter-clockwise."""
 
     speed: float
     turn: float
 
 
-STILL = VelocityCommand(0.0, 0.0)
+ZERO_VELOCITY = VelocityCommand(0.0, 0.0)
 
 
 class MaximumSpeeds(NamedTuple):
-    """The fastest: metres per second and radians per second."""
+    """Speed limits: m/s and rad/s."""
 
     speed: float
     turn: float
 
     def within(self, other: MaximumSpeeds) -> MaximumSpeeds:
-        """The stricter of each."""
+        """The lower of each."""
         return MaximumSpeeds(min(self.speed, other.speed), min(self.turn, other.turn))
 
 
@@ -48,224 +49,230 @@ def twist(command: VelocityCommand) -> dict[str, Any]:
     return {"linear": {"x": command.speed}, "angular": {"z": command.turn}}
 
 
-class StopNotice:
-    """The relay's stop, from when it is asked for until it is answered: it outlives the line it was asked by.
+class StopRequest:
+    """A stop request to the relay, until it is answered. It outlives the connection on which it was sent.
 
-    :ivar asked: whether it waits for its answer
-    :ivar done: whether the robot has done the last one
-    :ivar words: how the last one stands; empty before the first
+    :ivar pending: whether it waits for its answer
+    :ivar done: whether the robot has stopped, with all that belongs to it
+    :ivar text: result of the last request; empty before the first
     """
 
     def __init__(self) -> None:
-        self.asked = False
+        self.pending = False
         self.done = False
-        self.words = ""
+        self.text = ""
 
-    def ask(self) -> None:
-        """It is wanted."""
-        self.asked, self.done = True, False
-        self.words = "stop asked for, not answered yet"
+    def request(self) -> None:
+        """A stop was requested."""
+        self.pending, self.done = True, False
+        self.text = "stop requested, not confirmed yet"
 
-    def answer(self, answer: dict[str, Any]) -> None:
-        """The relay's answer has come.
+    def handle_answer(self, answer: dict[str, Any]) -> None:
+        """Take the relay's answer.
 
         :param answer: ``service_response`` of ``/relay/stop``
         """
         values = answer["values"]
-        self.asked = self.done = False
+        self.pending = self.done = False
         if not answer["result"]:
-            self.words = f"stop refused: {values}"
+            self.text = f"stop refused: {values}"
+        elif not values["success"] and values.get("stopped"):
+            # A part of the stop failed. It stays shown, as ``done`` is false.
+            self.text = f"stop: {values['message']}"
         elif not values["success"]:
-            self.words = f"stop not done: {values['message']}"
+            self.text = f"stop not done: {values['message']}"
         elif not values.get("done"):
-            self.words = "stop not done yet: the robot does it as soon as it is back"
+            self.text = "stop pending: the robot stops as soon as it is online"
         else:
             self.done = True
-            self.words = "stop: the robot is stopped until it is resumed"
+            self.text = "stop: the robot is stopped until it is resumed"
 
 
 class Driver:
-    """Drives a robot by one line, while that lasts. A stop that the line before left unanswered comes first.
+    """Drives a robot over one connection. A stop request that the last connection left unanswered is sent first.
 
-    :param line: to the robot
+    :param connection: to the robot
     :param topic: of the commands
-    :param name: of the program: what the relay writes down as the reason of what it asks
-    :param clock: seconds, suspends included
-    :param stop: what is known of the relay's stop, also by the lines before
-    :param heard: takes the messages of topics that the program itself has subscribed to: the topic, the message
-    :ivar in_control: whether the robot is this program's to drive
-    :ivar obstacle: why it can't be driven, in words; empty where nothing is known against it
-    :ivar suppressed: whether the topic obeys somebody else than who has control
-    :ivar wanted_by: who else asks for control; empty where nobody does
-    :ivar round_trip: seconds that the way to the robot and back took last; ``None`` before the first
-    :ivar said: what the relay refused last, in its words, until it is asked for something else
+    :param name: of the program; the relay logs it as the reason of its requests
+    :param clock: seconds, including suspends
+    :param stop: stop request, shared by successive connections
+    :param on_topic: called with topic and message of the program's own subscriptions
+    :ivar in_control: whether this program holds control
+    :ivar blocked_by: why the robot cannot be driven; empty when it can
+    :ivar suppressed: whether the topic is suppressed by another connection
+    :ivar requested_by: user that requests control; empty without a request
+    :ivar round_trip: last round trip to the robot, seconds; ``None`` before the first
+    :ivar refusal: what the relay refused last, in its words, until the next request
     """
 
     def __init__(
         self,
-        line: RosbridgeConnection,
+        connection: RosbridgeConnection,
         topic: str,
         name: str,
         clock: Callable[[], float],
-        stop: StopNotice,
-        heard: Callable[[str, dict[str, Any]], None] = lambda topic, message: None,
+        stop: StopRequest,
+        on_topic: Callable[[str, dict[str, Any]], None] = lambda topic, message: None,
     ) -> None:
         self.in_control = False
         self.suppressed = False
-        self.obstacle = ""
-        self.wanted_by = ""
+        self.blocked_by = ""
+        self.requested_by = ""
         self.round_trip: float | None = None
-        self.said = ""
-        self._line = line
+        self.refusal = ""
+        self._connection = connection
         self._topic = topic
         self._name = name
         self._clock = clock
         self._stop = stop
-        self._heard = heard
+        self._on_topic = on_topic
         self._level = ""
         self._limits: dict[str, Any] = {}
         self._waiting: dict[str, Callable[[dict[str, Any]], None]] = {}
-        self._asking = False
-        self._moved = False
-        self._beat = -math.inf
+        self._requesting = False
+        self._moving = False
+        self._pinged_at = -math.inf
         self._unanswered: float | None = None
-        if stop.asked:
-            self._say_stop()
-        line.say(op="set_level", level="error")
-        line.say(op="advertise", topic=topic, type=TWIST)
-        line.say(op="subscribe", topic="/relay/control")
-        line.say(op="subscribe", topic="/relay/status")
+        if stop.pending:
+            self._send_stop()
+        connection.send(op="set_level", level="error")
+        connection.send(op="advertise", topic=topic, type=TWIST)
+        connection.send(op="subscribe", topic="/relay/control")
+        connection.send(op="subscribe", topic="/relay/status")
 
     @property
     def limits(self) -> MaximumSpeeds:
-        """What the robot allows whoever drives here, as far as it is known."""
-        told = self._limits.get(self._level) or {}
-        found = (told.get(each) for each in ("linear", "angular"))
-        return MaximumSpeeds(*(math.inf if each is None else float(each) for each in found))
+        """The robot's speed limits for this user, as far as known."""
+        limits = self._limits.get(self._level) or {}
+        return MaximumSpeeds(speed=_limit(limits.get("linear")), turn=_limit(limits.get("angular")))
 
     @property
-    def late(self) -> bool:
-        """Whether the robot has not answered for so long that nobody should go on driving it."""
-        return self._silence > LATE
+    def unresponsive(self) -> bool:
+        """Whether the robot has not answered for so long that driving must end."""
+        return self._unanswered_seconds > UNRESPONSIVE_SECONDS
 
     @property
-    def _silence(self) -> float:
+    def _unanswered_seconds(self) -> float:
         return 0.0 if self._unanswered is None else self._clock() - self._unanswered
 
-    def hear(self, seconds: float) -> None:
-        """Take what comes within this time, one message at most, and see that the robot is reached.
+    def poll(self, seconds: float) -> None:
+        """Handle at most one message that arrives within ``seconds``, and ping the robot.
 
-        :raises Lost: nothing has come back for long
+        :raises Lost: the relay has not answered for :data:`LOST_SECONDS`
         """
-        message = self._line.hear(seconds)
+        message = self._connection.receive(seconds)
         if message is not None:
             self._take(message)
-        if self._silence > SILENT:
-            raise Lost(f"the relay has not answered for {SILENT:g} s")
+        if self._unanswered_seconds > LOST_SECONDS:
+            raise Lost(f"the relay has not answered for {LOST_SECONDS:g} s")
         now = self._clock()
-        if self._unanswered is None and now - self._beat >= BEAT:
-            self._beat = self._unanswered = now
-            self._ask("/relay/ping", self._beaten, robot=True)
+        if self._unanswered is None and now - self._pinged_at >= PING_SECONDS:
+            self._pinged_at = self._unanswered = now
+            self._ask("/relay/ping", self._ping_answered, robot=True)
 
-    def take(self) -> None:
-        """Ask for control; whether it is given is heard later, by ``in_control`` or ``said``."""
-        if not self.in_control and not self._asking:
-            self._asking = True
-            self.said = ""
-            self._ask("/relay/take_control", self._taken, why=self._name)
+    def request_control(self) -> None:
+        """Request control. ``in_control`` or ``refusal`` show the answer later."""
+        if not self.in_control and not self._requesting:
+            self._requesting = True
+            self.refusal = ""
+            self._ask("/relay/take_control", self._control_answered, why=self._name)
 
-    def give_back(self) -> None:
-        """Stand still, and let others drive."""
-        self.still()
-        if self.in_control or self._asking:
-            self.in_control = self._asking = False
-            self._ask("/relay/release_control", _unheeded, why=self._name)
+    def release_control(self) -> None:
+        """Stop the robot and release control."""
+        self.halt()
+        if self.in_control or self._requesting:
+            self.in_control = self._requesting = False
+            self._ask("/relay/release_control", _ignore, why=self._name)
 
-    def withdraw(self) -> None:
-        """Want control no more: a request that waits for its answer is taken back."""
-        self._asking = False
-        self._ask("/relay/release_control", _unheeded, why=self._name)
+    def withdraw_request(self) -> None:
+        """Withdraw a request for control."""
+        self._requesting = False
+        self._ask("/relay/release_control", _ignore, why=self._name)
 
     def stop(self) -> None:
-        """Stop the robot, whoever drives it, until somebody resumes it."""
-        # Wanted before anything is said: a line that breaks in saying it leaves it to the next.
-        self._stop.ask()
-        self.said = ""
-        self.still()
-        self._say_stop()
+        """Stop the robot until it is resumed. This needs no control."""
+        # Recorded before it is sent: if the connection breaks while sending, the next one sends it.
+        self._stop.request()
+        self.refusal = ""
+        self.halt()
+        self._send_stop()
 
     def drive(self, command: VelocityCommand) -> None:
-        """One command, within the robot's limits; nothing where it is not this program's to drive."""
+        """Send a command within the robot's limits, if this program holds control."""
         if not self.in_control:
             return
         top = self.limits
         speed = max(-top.speed, min(top.speed, command.speed))
         turn = max(-top.turn, min(top.turn, command.turn))
-        self._moved = bool(speed or turn)
-        self._line.say(op="publish", topic=self._topic, msg=twist(VelocityCommand(speed, turn)))
+        self._moving = bool(speed or turn)
+        self._connection.send(op="publish", topic=self._topic, msg=twist(VelocityCommand(speed, turn)))
 
-    def still(self) -> None:
-        """Zero, if the last command was none."""
-        if self._moved:
-            self.drive(STILL)
+    def halt(self) -> None:
+        """Send zero velocity, unless the last command was zero."""
+        if self._moving:
+            self.drive(ZERO_VELOCITY)
 
-    def _say_stop(self) -> None:
-        self._ask("/relay/stop", self._stopped, why=self._name)
+    def _send_stop(self) -> None:
+        self._ask("/relay/stop", self._stop_answered, why=self._name, stop_id=uuid4().hex)
 
     def _ask(self, service: str, answered: Callable[[dict[str, Any]], None], **args: Any) -> None:
-        self._waiting[self._line.call(service, **args)] = answered
+        self._waiting[self._connection.call(service, **args)] = answered
 
     def _take(self, message: dict[str, Any]) -> None:
         if message["op"] == "service_response":
-            self._waiting.pop(str(message["id"]), _unheeded)(message)
+            self._waiting.pop(str(message["id"]), _ignore)(message)
         elif message["op"] == "status":
-            self.said = str(message["msg"])
+            self.refusal = str(message["msg"])
         elif message["op"] == "publish" and message["topic"] == "/relay/control":
             self._control(message["msg"])
         elif message["op"] == "publish" and message["topic"] == "/relay/status":
             self._level = str(message["msg"]["level"] or "")
         elif message["op"] == "publish":
-            self._heard(str(message["topic"]), message["msg"])
+            self._on_topic(str(message["topic"]), message["msg"])
 
-    def _control(self, told: dict[str, Any]) -> None:
-        holder, request, stopped = told["holder"], told["request"], told["stopped"]
-        self.wanted_by = str(request["user"]) if request and not request["you"] else ""
-        self._limits = told["limits"] or {}
+    def _control(self, control: dict[str, Any]) -> None:
+        holder, request, stopped = control["holder"], control["request"], control["stopped"]
+        self.requested_by = str(request["user"]) if request and not request["you"] else ""
+        self._limits = control["limits"] or {}
         self.in_control = bool(holder and holder["you"])
-        elsewhere = (str(each["resource"]) for each in told.get("suppressed") or [])
+        elsewhere = (str(each["resource"]) for each in control.get("suppressed") or [])
         self.suppressed = self._topic.lstrip("/") in (each.lstrip("/") for each in elsewhere)
-        self._moved = self._moved and self.in_control
+        self._moving = self._moving and self.in_control
         if stopped:
-            self.obstacle = f"the robot is stopped by {stopped['by']}"
+            self.blocked_by = f"the robot is stopped by {stopped['by']}"
         elif holder and not holder["you"]:
-            self.obstacle = f"{holder['user']} has control"
-        elif not told["you"]["may_control"]:
-            self.obstacle = "you may not control this robot"
+            self.blocked_by = f"{holder['user']} has control"
+        elif not control["you"]["may_control"]:
+            self.blocked_by = "you may not control this robot"
         else:
-            self.obstacle = ""
+            self.blocked_by = ""
 
-    def _taken(self, answer: dict[str, Any]) -> None:
-        wanted, self._asking = self._asking, False
+    def _control_answered(self, answer: dict[str, Any]) -> None:
+        wanted, self._requesting = self._requesting, False
         self._answered(answer)
         if wanted and answer["result"] and answer["values"]["success"]:
             self.in_control = True
 
     def _answered(self, answer: dict[str, Any]) -> None:
         if not answer["result"]:
-            self.said = str(answer["values"])
+            self.refusal = str(answer["values"])
         elif not answer["values"]["success"]:
-            self.said = str(answer["values"]["message"])
+            self.refusal = str(answer["values"]["message"])
 
-    def _stopped(self, answer: dict[str, Any]) -> None:
-        # Of several that were asked for, the last one's answer counts.
-        if self._stopped not in self._waiting.values():
-            self._stop.answer(answer)
+    def _stop_answered(self, answer: dict[str, Any]) -> None:
+        # With several requests, the answer to the last one counts.
+        if self._stop_answered not in self._waiting.values():
+            self._stop.handle_answer(answer)
 
-    def _beaten(self, answer: dict[str, Any]) -> None:
+    def _ping_answered(self, answer: dict[str, Any]) -> None:
         asked, self._unanswered = self._unanswered, None
         if asked is not None and answer["result"]:
             self.round_trip = self._clock() - asked
 
 
-def _unheeded(answer: dict[str, Any]) -> None:
-    """What is answered changes nothing."""
+def _ignore(answer: dict[str, Any]) -> None:
+    """Handler of answers that change nothing."""
+
+
+def _limit(value: Any) -> float:
+    return math.inf if value is None else float(value)

@@ -1,9 +1,8 @@
-"""Has a robot greet who comes, and nobody twice: ``python -m robot_client.apps.greeting``.
+"""Makes a robot greet persons, each only once in a while: ``python -m robot_client.apps.greeting``.
 
-The robot's service ``faces`` says whom it sees, its service ``speech`` says the words. Whether somebody was greeted of
-late the relay's memory knows: "was this person greeted in the last minute?" So nobody is greeted twice when this
-program is started anew, or runs twice. Who greets writes down first that he is about to, then looks whether somebody
-else did so before him, and only then speaks. Where the memory does not answer nobody is greeted.
+The robot's service ``faces`` recognises persons, its service ``speech`` speaks. The relay's event log says whether a
+person was greeted recently, also when this program is restarted or runs twice. Before it speaks, the program logs that
+it is about to, and checks that no other program did so earlier. Without an answer of the relay, it greets no person.
 """
 
 from __future__ import annotations
@@ -17,42 +16,41 @@ from typing import Any, NamedTuple, Protocol
 
 import click
 
-from robot_client.apps.clock import now as since_start
-from robot_client.apps.connection import LivenessCheck, RosbridgeConnection, in_words, token
-from robot_client.apps.event_client import EventClient, Unanswered
-from robot_client.apps.reconnect import Ending, run_connected
-from robot_client.apps.status_line import StatusLine
-from robot_client.numbers import Number
+from relay_protocol.clocks import now as seconds_since_boot
+from robot_client.apps.connection import LivenessMonitor, RosbridgeConnection, access_token, errors_as_click
+from robot_client.apps.event_client import EventClient, EventLogUnavailable
+from robot_client.apps.program import ExitSignal, StatusLine, run_connected
+from robot_client.command_line import Number
 
-LOOK = 0.25
+POLL_SECONDS = 0.25
 BEGUN, GREETED = "greeting.begun", "greeted"
-"""Kinds of the events it writes: before it speaks, and after. The person is in their data."""
-EITHER = "greet*"
+"""Kinds of the events it logs: before and after it speaks. Their data has the person."""
+ANY_GREETING = "greet*"
 
-SURE = 2.0
-"""Seconds within which somebody must be seen in two pictures: one may be wrong."""
-CHECK = 2.0
-"""Seconds from one question about a person to the next."""
+CONFIRM_SECONDS = 2.0
+"""Seconds within which a person must be seen in two images, because one may be wrong."""
+RECHECK_SECONDS = 2.0
+"""Interval of queries about one person."""
 LONGEST_NAME = 64
-MOST = 50
-"""Persons of one picture that count."""
-KEPT = 1000
-"""Persons that are known at a time."""
+MAX_FACES = 50
+"""Most persons of one image."""
+MAX_PERSONS = 1000
+"""Most persons remembered."""
 STRANGER = "a stranger"
-"""Who is not recognised, by the events."""
+"""Name of an unrecognised person in events."""
 
-BEAT = 5.0
-"""Seconds from one question to the relay to the next."""
-SILENT = 15.0
-"""Seconds without a word of the relay after which there is no connection."""
+PING_SECONDS = 5.0
+"""Interval of pings to the relay."""
+LOST_SECONDS = 15.0
+"""Time without a message after which the connection counts as lost."""
 
 
 class GreetingConfig(NamedTuple):
-    """How it greets.
+    """Settings.
 
-    :ivar within: seconds within which nobody is greeted twice
-    :ivar text: what is said; ``{name}`` is the person's
-    :ivar strangers: what is said to who is not recognised; empty: nothing
+    :ivar within: least time between two greetings of a person, seconds
+    :ivar text: greeting; ``{name}`` is replaced by the name
+    :ivar strangers: greeting of unrecognised persons; empty for none
     """
 
     within: float = 60.0
@@ -60,32 +58,32 @@ class GreetingConfig(NamedTuple):
     strangers: str = ""
 
     def words(self, person: str) -> str:
-        """What is said to somebody."""
+        """The greeting of a person."""
         return self.strangers if person == STRANGER else self.text.replace("{name}", person)
 
 
-class Events(Protocol):
-    """What remembers, and speaks: :class:`~robot_client.apps.event_client.EventClient`."""
+class EventStore(Protocol):
+    """Event log and speech: :class:`~robot_client.apps.event_client.EventClient`."""
 
     def events(self, kind: str, last: float, **data: str) -> list[dict[str, Any]]:
-        """Events of the last so many seconds."""
+        """Events of the last ``last`` seconds."""
 
     def write(self, kind: str, **data: str) -> int:
-        """Keep an event; its number."""
+        """Log an event, and return its number."""
 
     def publish(self, topic: str, message: dict[str, Any], kind: str) -> None:
-        """Have the robot publish a message."""
+        """Publish a message on the robot."""
 
 
-def persons(text: Any, strangers: bool) -> list[str]:
-    """Whom the service ``faces`` sees.
+def person_names(text: Any, strangers: bool) -> list[str]:
+    """Names of the persons in a message of the service ``faces``.
 
-    :param text: ``data`` of ``faces/seen``; what makes no sense is nobody
-    :param strangers: whether who is not recognised counts, all as one
+    :param text: ``data`` of ``faces/seen``; invalid data gives no persons
+    :param strangers: include unrecognised persons, all as one
     """
     found: dict[str, None] = {}
     try:
-        for each in json.loads(text)["faces"][:MOST]:
+        for each in json.loads(text)["faces"][:MAX_FACES]:
             name = each["name"]
             if isinstance(name, str) and 0 < len(name) <= LONGEST_NAME and name.isprintable():
                 found[name] = None
@@ -96,128 +94,133 @@ def persons(text: Any, strangers: bool) -> list[str]:
     return list(found)
 
 
-class Attention:
-    """Who was seen often enough to be somebody, and is to be asked about."""
+class SightingFilter:
+    """Decides which sightings of persons to act on."""
 
     def __init__(self) -> None:
         self._seen: dict[str, float] = {}
         self._next: dict[str, float] = {}
 
     def due(self, person: str, now: float) -> bool:
-        """Somebody is seen: whether it is to be asked now if he was greeted."""
+        """Whether to query now if this person, who is seen, was greeted."""
         before = self._seen.get(person, -math.inf)
         self._seen[person] = now
-        if now - before > SURE or now < self._next.get(person, -math.inf):
+        if now - before > CONFIRM_SECONDS or now < self._next.get(person, -math.inf):
             return False
-        self._next[person] = now + CHECK
-        if len(self._seen) > KEPT:
-            self._seen = {name: at for name, at in self._seen.items() if now - at <= SURE}
+        self._next[person] = now + RECHECK_SECONDS
+        if len(self._seen) > MAX_PERSONS:
+            self._seen = {name: at for name, at in self._seen.items() if now - at <= CONFIRM_SECONDS}
             self._next = {name: at for name, at in self._next.items() if at > now}
         return True
 
 
 class Greeting:
-    """Hears whom the robot sees, asks, has it speak.
+    """Makes the robot greet the persons it sees.
 
     :param faces: topic of the service ``faces``
     :param say: topic of the service ``speech``
-    :param tell: takes what happens, in a few words
-    :param clock: seconds, suspends included
+    :param report: takes a short text about every change
+    :param clock: seconds, including suspends
     """
 
     def __init__(
         self,
         faces: str,
         say: str,
-        memory: Events,
-        manners: GreetingConfig,
-        tell: Callable[[str], None],
-        clock: Callable[[], float] = since_start,
+        events: EventStore,
+        config: GreetingConfig,
+        report: Callable[[str], None],
+        clock: Callable[[], float] = seconds_since_boot,
     ) -> None:
         self._faces = faces
         self._say = say
-        self._memory = memory
-        self._manners = manners
-        self._tell = tell
+        self._events = events
+        self._config = config
+        self._report = report
         self._clock = clock
-        self._attention = Attention()
-        self._pulse: LivenessCheck
+        self._sightings = SightingFilter()
+        self._liveness: LivenessMonitor
 
-    def begin(self, line: RosbridgeConnection) -> None:
-        """There is a line."""
-        self._pulse = LivenessCheck(line, self._clock, BEAT, SILENT)
-        line.say(op="set_level", level="error")
-        line.say(op="subscribe", topic=self._faces, type="std_msgs/msg/String", queue_length=1)
-        self._tell("looking for people")
+    def begin(self, connection: RosbridgeConnection) -> None:
+        """A connection was made."""
+        self._liveness = LivenessMonitor(connection, self._clock, PING_SECONDS, LOST_SECONDS)
+        connection.send(op="set_level", level="error")
+        connection.send(op="subscribe", topic=self._faces, type="std_msgs/msg/String", queue_length=1)
+        self._report("looking for people")
 
     def step(self) -> bool:
-        """Take what comes within a moment, and act on it.
+        """Receive one message, and act on it.
 
         :raises Lost: nothing has come for long
-        :raises Refused: the relay says no, and will until a person has done something
+        :raises Refused: the relay refuses, and a retry does not help
         """
-        message = self._pulse.hear(LOOK)
+        message = self._liveness.receive(POLL_SECONDS)
         if message is not None:
             self._take(message)
         return True
 
     def leave(self) -> None:
-        """Nothing is held."""
+        """Nothing to release."""
 
     def lost(self, why: str, seconds: float) -> None:
-        """Say so."""
-        self._tell(f"{why}; again in {seconds:.1f} s")
+        """Report it."""
+        self._report(f"{why}; again in {seconds:.1f} s")
 
     def _take(self, message: dict[str, Any]) -> None:
         if message["op"] == "status":
-            self._tell(f"refused: {message['msg']}")
+            self._report(f"refused: {message['msg']}")
         elif message["op"] == "publish" and message["topic"] == self._faces:
-            for person in persons(message["msg"].get("data"), bool(self._manners.strangers)):
-                if self._attention.due(person, self._clock()):
+            for person in person_names(message["msg"].get("data"), bool(self._config.strangers)):
+                if self._sightings.due(person, self._clock()):
                     try:
-                        self._tell(self._greet(person))
-                    except Unanswered as error:
-                        self._tell(f"{person} is not greeted: {error}")
+                        self._report(self._greet(person))
+                    except EventLogUnavailable as error:
+                        self._report(f"{person} is not greeted: {error}")
 
     def _greet(self, person: str) -> str:
-        """What became of it."""
-        memory, within = self._memory, self._manners.within
-        if memory.events(EITHER, within, person=person):
+        """Greet a person unless that was done, and return the result for display."""
+        events, within = self._events, self._config.within
+        if events.events(ANY_GREETING, within, person=person):
             return f"{person} was greeted already"
-        own = memory.write(BEGUN, person=person)
-        # Two may have asked at the same time; their numbers say who came first.
-        if any(int(each["id"]) < own for each in memory.events(EITHER, within, person=person)):
+        own = events.write(BEGUN, person=person)
+        # Two programs may do this at the same time; the lower event number wins.
+        if any(int(each["id"]) < own for each in events.events(ANY_GREETING, within, person=person)):
             return f"{person} is greeted by another program"
-        memory.publish(self._say, {"data": self._manners.words(person)}, "std_msgs/msg/String")
-        memory.write(GREETED, person=person)
+        events.publish(self._say, {"data": self._config.words(person)}, "std_msgs/msg/String")
+        events.write(GREETED, person=person)
         return f"greeted {person}"
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("url")
 @click.option(
-    "--faces", default="/faces/seen", show_default=True, metavar="TOPIC", help="Of the service 'faces'."
+    "--faces", default="/faces/seen", show_default=True, metavar="TOPIC", help="Topic of the service 'faces'."
 )
-@click.option("--say", default="/say", show_default=True, metavar="TOPIC", help="Of the service 'speech'.")
+@click.option(
+    "--say", default="/say", show_default=True, metavar="TOPIC", help="Topic of the service 'speech'."
+)
 @click.option(
     "--within",
     type=Number(1, 86400),
     default=GreetingConfig().within,
     show_default=True,
     metavar="S",
-    help="Nobody is greeted twice within.",
+    help="Least time between two greetings of a person.",
 )
 @click.option(
-    "--text", default=GreetingConfig().text, show_default=True, help="What is said; {name} is the person's."
+    "--text",
+    default=GreetingConfig().text,
+    show_default=True,
+    help="Greeting; {name} is replaced by the name.",
 )
 @click.option(
-    "--strangers", default="", metavar="TEXT", help="What is said to who is not recognised. Default: nothing."
+    "--strangers", default="", metavar="TEXT", help="Greeting of unrecognised persons. Default: none."
 )
 def main(url: str, faces: str, say: str, within: float, text: str, strangers: str) -> None:
-    """Have the robot at URL (ws://relay/robots/NAME) greet whom it recognises, and nobody twice.
+    """Make the robot at URL (ws://relay/robots/NAME) greet the persons it recognises.
 
-    It takes the robot's services 'faces' and 'speech'. SIGINT and SIGTERM end it. The token comes from the variable
-    SWITCHBOARD_TOKEN.
+    The robot must run the services 'faces' and 'speech'. The access token is read from SWITCHBOARD_TOKEN. SIGINT and
+    SIGTERM end the program.
 
     \b
     Examples:
@@ -225,13 +228,13 @@ def main(url: str, faces: str, say: str, within: float, text: str, strangers: st
       python -m robot_client.apps.greeting $ROBOT
       python -m robot_client.apps.greeting $ROBOT --within 3600 --text 'Good morning, {name}.' --strangers Hello.
     """
-    token()
-    ending = Ending()
+    access_token()
+    exit_signal = ExitSignal()
     status = StatusLine(sys.stdout, time.monotonic)
-    with in_words():
-        program = Greeting(faces, say, EventClient(url), GreetingConfig(within, text, strangers), status.tell)
-        run_connected(url, program, ending)
-    status.end("ended")
+    with errors_as_click():
+        program = Greeting(faces, say, EventClient(url), GreetingConfig(within, text, strangers), status.show)
+        run_connected(url, program, exit_signal)
+    status.finish("ended")
 
 
 if __name__ == "__main__":

@@ -1,90 +1,244 @@
 """Drives a robot whose battery is low to its charger: ``python -m robot_client.apps.recharge``.
 
-It watches the battery. When that is low it takes control, turns until the service ``markers`` sees the charger's
-marker, drives there, stands, and gives control back. It never takes control from anybody: while somebody has it, or
-has stopped the robot, it waits; when somebody asks for it, it gives it at once. What is in the way, a marker that is
-lost, a scanner that is silent, a robot that does not answer: it stands.
+When the battery is low, it takes control, turns until the service ``markers`` sees the charger's marker, drives there,
+stops, and releases control. It never takes control from others: while another client holds control or the robot is
+stopped, it waits, and it releases control on request. It stops for obstacles, a lost marker, a silent scanner and a
+robot that does not answer.
 """
 
 from __future__ import annotations
 
 import enum
+import json
 import math
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 
-from robot_client.apps.clock import now as since_start
-from robot_client.apps.connection import RosbridgeConnection, in_words, token
-from robot_client.apps.docking import (
-    UNKNOWN,
-    Approach,
-    Charge,
-    DockingTopics,
-    Need,
-    Sighting,
-    charge,
-    sighting,
-    way_ahead,
-)
-from robot_client.apps.driver import STILL, Driver, StopNotice, VelocityCommand
-from robot_client.apps.options import driving
-from robot_client.apps.reconnect import Ending, run_connected
-from robot_client.apps.status_line import StatusLine
-from robot_client.numbers import Number
+from relay_protocol.clocks import now as seconds_since_boot
+from robot_client.apps.connection import RosbridgeConnection, access_token, errors_as_click
+from robot_client.apps.driver import ZERO_VELOCITY, Driver, StopRequest, VelocityCommand
+from robot_client.apps.program import ExitSignal, StatusLine, driving, run_connected
+from robot_client.command_line import Number
+
+HALF_WIDTH = 0.25
+"""Half the width of the robot's path, metres."""
+FRONT = math.radians(60)
+"""Half the angle of the scanner that counts as ahead, radians."""
+
+SPEED_GAIN = 0.6
+"""m/s for each metre of remaining distance."""
+MIN_SPEED = 0.05
+"""Least speed towards the marker, m/s."""
+TURN_GAIN = 1.5
+"""rad/s for each radian of bearing."""
+TURN_FIRST_ANGLE = math.radians(25)
+"""With a larger bearing the robot only turns."""
+
+CHARGING, FULL = 1, 4
+UNKNOWN = 0
+"""Numbers of sensor_msgs/BatteryState's ``power_supply_status``."""
+
+
+class DockingTopics(NamedTuple):
+    """Topics.
+
+    :ivar battery: BatteryState
+    :ivar markers: String, of the service ``markers``
+    :ivar scan: LaserScan
+    """
+
+    battery: str
+    markers: str
+    scan: str
+
+    def with_types(self) -> list[tuple[str, str]]:
+        """Each topic with its type."""
+        return [
+            (self.battery, "sensor_msgs/msg/BatteryState"),
+            (self.markers, "std_msgs/msg/String"),
+            (self.scan, "sensor_msgs/msg/LaserScan"),
+        ]
+
+
+class Charge(NamedTuple):
+    """State of a battery.
+
+    :ivar level: 0 to 1
+    :ivar status: as in sensor_msgs/BatteryState
+    """
+
+    level: float
+    status: int
+
+    @property
+    def charging(self) -> bool:
+        """Whether it reports that a charger is connected."""
+        return self.status in (CHARGING, FULL)
+
+
+def parse_battery(message: dict[str, Any]) -> Charge | None:
+    """Parse a ``sensor_msgs/BatteryState``; ``None`` without a charge from 0 to 1."""
+    share, status = message.get("percentage"), message.get("power_supply_status")
+    if not isinstance(share, (int, float)) or not 0.0 <= share <= 1.0:
+        return None
+    return Charge(float(share), status if isinstance(status, int) else UNKNOWN)
+
+
+class ChargeNeed:
+    """Whether a battery needs charging: from low until enough, with hysteresis.
+
+    :param low: charge, 0 to 1, below which it is low
+    :param enough: charge from which it is enough
+    :ivar urgent: whether it needs charging
+    """
+
+    def __init__(self, low: float, enough: float) -> None:
+        self._low = low
+        self._enough = enough
+        self.urgent = False
+
+    def update(self, seen: Charge) -> None:
+        """Take the current state."""
+        if seen.level >= self._enough or seen.status == FULL:
+            self.urgent = False
+        elif seen.level < self._low:
+            self.urgent = True
+
+
+class Sighting(NamedTuple):
+    """Position of a marker.
+
+    :ivar distance: metres
+    :ivar bearing: radians from straight ahead, to the left
+    """
+
+    distance: float
+    bearing: float
+
+
+def parse_marker(text: Any, number: int) -> Sighting | None:
+    """Find a marker in a message of the service ``markers``.
+
+    :param text: ``data`` of ``markers/seen``
+    :param number: the marker's
+    :returns: ``None`` when it is not seen or the data is invalid
+    """
+    try:
+        for each in json.loads(text)["markers"]:
+            if each["id"] == number:
+                found = Sighting(float(each["distance"]), float(each["bearing"]))
+                return found if all(map(math.isfinite, found)) and found.distance > 0.0 else None
+    except (ValueError, TypeError, KeyError):
+        pass
+    return None
+
+
+def clearance_ahead(message: dict[str, Any]) -> float | None:
+    """Metres to the nearest obstacle ahead, infinite when there is none.
+
+    :param message: ``sensor_msgs/LaserScan`` of a scanner that looks ahead, in the middle of the robot
+    :returns: ``None`` when the scan is invalid or no ray has a measurement
+    """
+    try:
+        ranges, begin, step = (
+            message["ranges"],
+            float(message["angle_min"]),
+            float(message["angle_increment"]),
+        )
+        nearest, measured = math.inf, False
+        for number, distance in enumerate(ranges):
+            # JSON has null for infinity and NaN.
+            if distance is None or not distance > 0.0:
+                continue
+            measured = True
+            angle = math.remainder(begin + number * step, math.tau)
+            if abs(angle) <= FRONT and abs(distance * math.sin(angle)) <= HALF_WIDTH:
+                nearest = min(nearest, distance * math.cos(angle))
+    except (TypeError, KeyError, ValueError):
+        return None
+    return nearest if measured else None
+
+
+class Approach(NamedTuple):
+    """Drives towards a marker.
+
+    :ivar distance: from the marker at the goal, metres
+    :ivar speed: maximum, m/s
+    :ivar turn: maximum, rad/s
+    """
+
+    distance: float
+    speed: float
+    turn: float
+
+    def arrived(self, seen: Sighting) -> bool:
+        """Whether the goal is reached."""
+        return seen.distance <= self.distance
+
+    def command(self, seen: Sighting) -> VelocityCommand:
+        """The command towards the marker."""
+        if self.arrived(seen):
+            return ZERO_VELOCITY
+        turn = max(-self.turn, min(self.turn, TURN_GAIN * seen.bearing))
+        if abs(seen.bearing) > TURN_FIRST_ANGLE:
+            return VelocityCommand(0.0, turn)
+        speed = max(MIN_SPEED, SPEED_GAIN * (seen.distance - self.distance))
+        return VelocityCommand(min(self.speed, speed), turn)
+
 
 NAME = "recharge"
-LOOK = EVERY = 0.05
-"""Seconds from one command to the next."""
+POLL_SECONDS = COMMAND_SECONDS = 0.05
+"""Interval of commands."""
 
 SEEKING_TURN = 0.4
-"""Radians per second at which it looks for the marker, at most."""
+"""Maximum turn rate of the search, rad/s."""
 SLOWEST_TURN = 0.05  # what is counted with where a robot is allowed less
-ROUND = 1.5 * math.tau
-"""Radians that it turns before it says that the marker is not there."""
+SEARCH_ANGLE = 1.5 * math.tau
+"""Radians turned before the search fails."""
 
-FRESH = 0.3
-"""Seconds that it drives by a sighting: where pictures come slowly it goes step by step."""
-SILENCE = 0.7
-"""Seconds without a command by which it has let go (SPEC section 2.5: half a second)."""
-BLIND = 0.5
-"""Seconds without a scan after which it does not drive."""
-GLIMPSE = 1.0
-"""Seconds within which a marker must be seen in two pictures; when it was in one it stands until then."""
-LOST = 3.0
-"""Seconds without a sighting after which the marker is looked for again."""
-CALM = 5.0
-"""Seconds it leaves the robot alone after somebody else had it, had stopped it, or wanted it."""
-AGAIN = 60.0
+SIGHTING_SECONDS = 0.3
+"""Seconds for which a sighting is used. With slow images the robot moves step by step."""
+RELEASE_SECONDS = 0.7
+"""Seconds without a command that count as a release (SPEC 2.5: half a second)."""
+SCAN_TIMEOUT = 0.5
+"""Seconds without a scan after which it stops."""
+CONFIRM_SECONDS = 1.0
+"""Seconds within which a marker must be seen in two images. After the first the robot waits."""
+MARKER_LOST_SECONDS = 3.0
+"""Seconds without a sighting after which the search starts again."""
+BACK_OFF_SECONDS = 5.0
+"""Seconds to wait after another client held or requested control, or the robot was stopped."""
+RETRY_SECONDS = 60.0
 """Seconds from a failure to the next attempt."""
-PATIENCE = 30.0
-"""Seconds that it waits before something in the way."""
+BLOCKED_SECONDS = 30.0
+"""Seconds to wait for an obstacle to go."""
 
 
 class RechargePhase(enum.Enum):
-    """What it does."""
+    """What the program does."""
 
     WATCHING = "watching"
     WAITING = "waiting"
     SEEKING = "seeking"
-    GOING = "going"
-    STAYING = "staying"
+    DRIVING = "driving"
+    DOCKED = "docked"
 
 
 class Recharge:
-    """Watches, seeks, drives.
+    """Watches the battery, searches the charger, and drives there.
 
     :param topics: of battery, markers and scanner
     :param command: topic of the commands
-    :param marker: number of the charger's
-    :param need: says when the battery is to be charged
-    :param approach: how it drives there; its speeds within what the robot allows
-    :param clear: metres to what is in the way ahead, nearer than which it stands
-    :param tell: takes the state in a few words, and what changes all the time
-    :param clock: seconds, suspends included
+    :param marker: number of the charger's marker
+    :param need: decides when to charge
+    :param approach: how to drive to the marker; the robot's own limits apply too
+    :param clear: stop for obstacles ahead that are nearer, metres
+    :param report: takes the state, and details that change all the time
+    :param clock: seconds, including suspends
     """
 
     def __init__(
@@ -92,11 +246,11 @@ class Recharge:
         topics: DockingTopics,
         command: str,
         marker: int,
-        need: Need,
+        need: ChargeNeed,
         approach: Approach,
         clear: float,
-        tell: Callable[[str, str], None],
-        clock: Callable[[], float] = since_start,
+        report: Callable[[str, str], None],
+        clock: Callable[[], float] = seconds_since_boot,
     ) -> None:
         self._topics = topics
         self._command = command
@@ -104,209 +258,209 @@ class Recharge:
         self._need = need
         self._approach = approach
         self._clear = clear
-        self._tell = tell
+        self._report = report
         self._clock = clock
         self._driver: Driver
-        self._stop = StopNotice()
-        self._rest()
+        self._stop = StopRequest()
+        self._reset()
         self._do = {
             RechargePhase.WATCHING: self._watch,
             RechargePhase.WAITING: self._wait,
             RechargePhase.SEEKING: self._seek,
-            RechargePhase.GOING: self._go,
-            RechargePhase.STAYING: self._stay,
+            RechargePhase.DRIVING: self._drive_to_charger,
+            RechargePhase.DOCKED: self._stay_docked,
         }
 
-    def _rest(self) -> None:
-        """Nothing is known, and nothing under way."""
+    def _reset(self) -> None:
+        """Forget all state."""
         self.phase = RechargePhase.WATCHING
         self._charge: Charge | None = None
         self._seen: Sighting | None = None
-        self._seen_at = self._glimpsed_at = self._scanned_at = self._sent = -math.inf
+        self._seen_at = self._first_seen_at = self._scanned_at = self._sent = -math.inf
         self._ahead: float | None = None
         self._not_before = -math.inf
         self._since = 0.0
-        """When the phase began, or in it what is waited for."""
+        """Start of the phase, or of the wait in it."""
         self._side = 1.0
         self._failed = ""
-        """Why the last attempt failed, until the next."""
+        """Why the last attempt failed; empty after the next one begins."""
 
-    def begin(self, line: RosbridgeConnection) -> None:
-        """There is a line. What was under way before is begun anew."""
-        self._rest()
-        self._driver = Driver(line, self._command, NAME, self._clock, self._stop, self._heard)
-        for topic, kind in self._topics.kinds():
-            line.say(op="subscribe", topic=topic, type=kind, queue_length=1)
-        self._tell("waiting for what the battery tells", "")
+    def begin(self, connection: RosbridgeConnection) -> None:
+        """A connection was made; start again."""
+        self._reset()
+        self._driver = Driver(connection, self._command, NAME, self._clock, self._stop, self._on_topic)
+        for topic, kind in self._topics.with_types():
+            connection.send(op="subscribe", topic=topic, type=kind, queue_length=1)
+        self._report("waiting for the battery state", "")
 
     def step(self) -> bool:
-        """Take what comes within a moment, and act on it."""
-        self._driver.hear(LOOK)
+        """Receive one message, and act on it."""
+        self._driver.poll(POLL_SECONDS)
         now = self._clock()
-        if self.phase in (RechargePhase.SEEKING, RechargePhase.GOING):
+        if self.phase in (RechargePhase.SEEKING, RechargePhase.DRIVING):
             why_not = self._why_not(now) or ("" if self._driver.in_control else "control is lost")
             if why_not or not self._wanted():
-                self._let_go(now, why_not or "the battery needs no charging any more")
-            elif self._driver.said:
+                self._release(now, why_not or "the battery needs no charging any more")
+            elif self._driver.refusal:
                 self._pause(now)
         self._do[self.phase](now)
         return True
 
     def leave(self) -> None:
-        """Stand still, and let others drive."""
-        self._driver.give_back()
+        """Stop the robot and release control."""
+        self._driver.release_control()
 
     def lost(self, why: str, seconds: float) -> None:
-        """Say so; the robot stands by itself."""
-        self._tell(f"{why}; again in {seconds:.1f} s", "")
+        """Report it. The robot stops by itself."""
+        self._report(f"{why}; again in {seconds:.1f} s", "")
 
-    def _heard(self, topic: str, message: dict[str, Any]) -> None:
+    def _on_topic(self, topic: str, message: dict[str, Any]) -> None:
         now = self._clock()
         if topic == self._topics.battery:
-            self._charge = charge(message)
+            self._charge = parse_battery(message)
             if self._charge is not None:
-                self._need.see(self._charge)
+                self._need.update(self._charge)
         elif topic == self._topics.markers:
-            if (seen := sighting(message.get("data"), self._marker)) is not None:
-                # One alone may be something else that looks like it.
-                if now - self._glimpsed_at <= GLIMPSE:
+            if (seen := parse_marker(message.get("data"), self._marker)) is not None:
+                # A single sighting may be a false detection.
+                if now - self._first_seen_at <= CONFIRM_SECONDS:
                     self._seen, self._seen_at = seen, now
-                self._glimpsed_at = now
+                self._first_seen_at = now
         elif topic == self._topics.scan:
-            self._ahead = way_ahead(message)
+            self._ahead = clearance_ahead(message)
             if self._ahead is not None:
                 self._scanned_at = now
 
     def _wanted(self) -> bool:
-        return self._need.urgent and self._charge is not None and not self._charge.fed
+        return self._need.urgent and self._charge is not None and not self._charge.charging
 
     def _why_not(self, now: float) -> str:
-        """Why it must not drive now; empty when it may."""
+        """Why the robot must not be driven now; empty when it may."""
         driver = self._driver
-        others = driver.obstacle or (driver.wanted_by and f"{driver.wanted_by} asks for control")
+        others = driver.blocked_by or (driver.requested_by and f"{driver.requested_by} asks for control")
         if others:
-            self._not_before, self._failed = max(self._not_before, now + CALM), ""
+            self._not_before, self._failed = max(self._not_before, now + BACK_OFF_SECONDS), ""
             return others
         if driver.suppressed:
             return "another program suppresses its commands"
-        if driver.late:
+        if driver.unresponsive:
             return "the robot does not answer"
-        if now - self._scanned_at > BLIND:
-            why = driver.said or "it would not see what is in the way"
-            return f"nothing comes on {self._topics.scan}: {why}"
+        if now - self._scanned_at > SCAN_TIMEOUT:
+            why = driver.refusal or "obstacles would not be seen"
+            return f"nothing is received on {self._topics.scan}: {why}"
         return ""
 
-    def _let_go(self, now: float, why: str) -> None:
-        """Stand, give control back, and wait."""
-        self._driver.give_back()
-        self._become(RechargePhase.WAITING, now)
-        self._tell(f"control given back: {why}", "")
+    def _release(self, now: float, why: str) -> None:
+        """Stop, release control, and wait."""
+        self._driver.release_control()
+        self._enter(RechargePhase.WAITING, now)
+        self._report(f"control released: {why}", "")
 
     def _pause(self, now: float) -> None:
-        """A command was refused: let go, so that the next is obeyed."""
-        self._tell(f"refused: {self._driver.said}", "")
-        self._driver.said = ""
-        self._driver.still()
-        self._sent = now + SILENCE
+        """A command was refused: pause, so that it counts as a release."""
+        self._report(f"refused: {self._driver.refusal}", "")
+        self._driver.refusal = ""
+        self._driver.halt()
+        self._sent = now + RELEASE_SECONDS
 
     def _fail(self, now: float, why: str) -> None:
-        self._failed, self._not_before = why, now + AGAIN
-        self._let_go(now, f"{why}; again in {AGAIN:.0f} s")
+        self._failed, self._not_before = why, now + RETRY_SECONDS
+        self._release(now, f"{why}; again in {RETRY_SECONDS:.0f} s")
 
-    def _become(self, phase: RechargePhase, now: float) -> None:
+    def _enter(self, phase: RechargePhase, now: float) -> None:
         self.phase, self._since = phase, now
 
     def _percent(self) -> str:
-        return "battery" if self._charge is None else f"battery {self._charge.share * 100:.0f} %"
+        return "battery" if self._charge is None else f"battery {self._charge.level * 100:.0f} %"
 
     def _watch(self, now: float) -> None:
         if self._wanted():
-            self._become(RechargePhase.WAITING, now)
+            self._enter(RechargePhase.WAITING, now)
         elif self._charge is not None:
-            self._tell("charging" if self._charge.fed else "watching the battery", self._percent())
-        elif self._driver.said:
-            self._tell(f"refused: {self._driver.said}", "")
+            self._report("charging" if self._charge.charging else "watching the battery", self._percent())
+        elif self._driver.refusal:
+            self._report(f"refused: {self._driver.refusal}", "")
 
     def _wait(self, now: float) -> None:
         driver = self._driver
         if not self._wanted():
-            self._become(RechargePhase.WATCHING, now)
+            self._enter(RechargePhase.WATCHING, now)
             return
         why_not = self._why_not(now)
         if driver.in_control and not why_not and now >= self._not_before:
-            # Who drove a moment ago by a connection that is lost must let go first (SPEC section 2.5).
-            driver.drive(STILL)
-            self._sent = now + SILENCE
-            self._become(RechargePhase.SEEKING, now)
-            self._tell(f"looking for marker {self._marker}", self._percent())
+            # After a lost connection the commands must pause first (SPEC 2.5).
+            driver.drive(ZERO_VELOCITY)
+            self._sent = now + RELEASE_SECONDS
+            self._enter(RechargePhase.SEEKING, now)
+            self._report(f"looking for marker {self._marker}", self._percent())
             return
-        if not why_not and driver.said and not driver.in_control:
-            # It was asked for in the moment in which somebody else took it; a request would be in his way.
-            self._failed, driver.said = driver.said, ""
-            driver.withdraw()
-            self._not_before = now + CALM
+        if not why_not and driver.refusal and not driver.in_control:
+            # Another client took control at the same time; withdraw the request.
+            self._failed, driver.refusal = driver.refusal, ""
+            driver.withdraw_request()
+            self._not_before = now + BACK_OFF_SECONDS
         if driver.in_control or why_not or now < self._not_before:
-            why = why_not or self._failed or "the robot was somebody else's a moment ago"
-            self._tell(f"the battery is low, and it waits: {why}", self._percent())
-            driver.give_back()
+            why = why_not or self._failed or "another client used the robot recently"
+            self._report(f"battery low, waiting: {why}", self._percent())
+            driver.release_control()
         else:
             self._failed = ""
-            driver.take()
+            driver.request_control()
 
     def _seek(self, now: float) -> None:
         turn = min(SEEKING_TURN, self._approach.turn, self._driver.limits.turn)
-        if now - self._seen_at <= FRESH:
-            self._become(RechargePhase.GOING, now)
-            self._tell(f"driving to marker {self._marker}", self._percent())
-        elif now - self._since > ROUND / max(turn, SLOWEST_TURN):
-            self._fail(now, f"marker {self._marker} is nowhere around")
-        elif now - self._glimpsed_at <= GLIMPSE:
-            self._driver.still()
+        if now - self._seen_at <= SIGHTING_SECONDS:
+            self._enter(RechargePhase.DRIVING, now)
+            self._report(f"driving to marker {self._marker}", self._percent())
+        elif now - self._since > SEARCH_ANGLE / max(turn, SLOWEST_TURN):
+            self._fail(now, f"marker {self._marker} was not found")
+        elif now - self._first_seen_at <= CONFIRM_SECONDS:
+            self._driver.halt()
         else:
             self._drive(VelocityCommand(0.0, self._side * turn), now)
 
-    def _go(self, now: float) -> None:
+    def _drive_to_charger(self, now: float) -> None:
         assert self._seen is not None
         missing = now - self._seen_at
-        if missing > LOST:
+        if missing > MARKER_LOST_SECONDS:
             self._side = math.copysign(1.0, self._seen.bearing)
-            self._become(RechargePhase.SEEKING, now)
-            self._tell(f"marker {self._marker} is lost: looking for it", self._percent())
-        elif missing > FRESH:
-            self._driver.still()
+            self._enter(RechargePhase.SEEKING, now)
+            self._report(f"marker {self._marker} is lost: looking for it", self._percent())
+        elif missing > SIGHTING_SECONDS:
+            self._driver.halt()
         elif self._approach.arrived(self._seen):
-            self._driver.give_back()
-            self._become(RechargePhase.STAYING, now)
+            self._driver.release_control()
+            self._enter(RechargePhase.DOCKED, now)
         elif self._ahead is not None and self._ahead < self._clear:
             self._stand_before(now)
         else:
             self._since = now
-            self._tell(f"driving to marker {self._marker}", f"{self._seen.distance:.2f} m")
+            self._report(f"driving to marker {self._marker}", f"{self._seen.distance:.2f} m")
             self._drive(self._approach.command(self._seen), now)
 
     def _stand_before(self, now: float) -> None:
-        self._driver.still()
-        self._tell("something is in the way: it stands", f"{self._ahead:.2f} m")
-        if now - self._since > PATIENCE:
-            self._fail(now, "something is in the way")
+        self._driver.halt()
+        self._report("stopped: obstacle ahead", f"{self._ahead:.2f} m")
+        if now - self._since > BLOCKED_SECONDS:
+            self._fail(now, "an obstacle is ahead")
 
-    def _stay(self, now: float) -> None:
+    def _stay_docked(self, now: float) -> None:
         if not self._need.urgent:
-            self._become(RechargePhase.WATCHING, now)
-        elif self._charge is not None and self._charge.fed:
+            self._enter(RechargePhase.WATCHING, now)
+        elif self._charge is not None and self._charge.charging:
             self._since = now
-            self._tell("charging", self._percent())
+            self._report("charging", self._percent())
         elif self._charge is not None and self._charge.status == UNKNOWN:
-            self._tell(f"stands at marker {self._marker}", self._percent())
+            self._report(f"stands at marker {self._marker}", self._percent())
         else:
-            self._tell(
+            self._report(
                 f"stands at marker {self._marker}, and the battery does not charge yet", self._percent()
             )
-            if now - self._since > AGAIN:
-                self._become(RechargePhase.WAITING, now)
+            if now - self._since > RETRY_SECONDS:
+                self._enter(RechargePhase.WAITING, now)
 
     def _drive(self, command: VelocityCommand, now: float) -> None:
-        if now - self._sent >= EVERY:
+        if now - self._sent >= COMMAND_SECONDS:
             self._sent = now
             self._driver.drive(command)
 
@@ -315,17 +469,23 @@ class Recharge:
 @driving
 @click.option("--battery", default="/battery_state", show_default=True, metavar="TOPIC")
 @click.option(
-    "--markers", default="/markers/seen", show_default=True, metavar="TOPIC", help="Of the service 'markers'."
+    "--markers",
+    default="/markers/seen",
+    show_default=True,
+    metavar="TOPIC",
+    help="Topic of the service 'markers'.",
 )
-@click.option("--scan", default="/scan", show_default=True, metavar="TOPIC", help="Of the scanner.")
-@click.option("--marker", type=click.IntRange(0), default=7, show_default=True, help="The charger's.")
+@click.option("--scan", default="/scan", show_default=True, metavar="TOPIC", help="Topic of the scanner.")
+@click.option(
+    "--marker", type=click.IntRange(0), default=7, show_default=True, help="Number of the charger's marker."
+)
 @click.option(
     "--low",
     type=Number(0, 100),
     default=20.0,
     show_default=True,
     metavar="PERCENT",
-    help="It drives there below.",
+    help="Charge below which it drives to the charger.",
 )
 @click.option(
     "--enough",
@@ -333,7 +493,7 @@ class Recharge:
     default=80.0,
     show_default=True,
     metavar="PERCENT",
-    help="From here on the battery may become low again.",
+    help="Charge from which the battery counts as charged.",
 )
 @click.option(
     "--distance",
@@ -341,7 +501,7 @@ class Recharge:
     default=0.45,
     show_default=True,
     metavar="M",
-    help="From the marker to the camera, where it is there.",
+    help="Distance of camera and marker at the charger.",
 )
 @click.option(
     "--clear",
@@ -349,7 +509,7 @@ class Recharge:
     default=0.3,
     show_default=True,
     metavar="M",
-    help="It stands when something ahead is nearer to the scanner.",
+    help="Stop for obstacles nearer to the scanner.",
 )
 def main(
     url: str,
@@ -367,8 +527,8 @@ def main(
 ) -> None:
     """Drive the robot at URL (ws://relay/robots/NAME) to its charger when its battery is low.
 
-    Camera and scanner look ahead, from the middle of the robot. The charger is where its marker is, which the service
-    'markers' of the robot sees. SIGINT and SIGTERM end it. The token comes from the variable SWITCHBOARD_TOKEN.
+    Camera and scanner must point ahead from the middle of the robot, and the service 'markers' must run. The access
+    token is read from SWITCHBOARD_TOKEN. SIGINT and SIGTERM end the program.
 
     \b
     Examples:
@@ -379,21 +539,21 @@ def main(
         raise click.BadParameter(f"--enough ({enough:g}) must be more than --low ({low:g})")
     if clear >= distance:
         raise click.BadParameter(f"--clear ({clear:g}) must be less than --distance ({distance:g})")
-    token()
-    ending = Ending()
+    access_token()
+    exit_signal = ExitSignal()
     status = StatusLine(sys.stdout, time.monotonic)
     program = Recharge(
         DockingTopics(battery, markers, scan),
         topic,
         marker,
-        Need(low / 100, enough / 100),
+        ChargeNeed(low / 100, enough / 100),
         Approach(distance, speed, turn),
         clear,
-        status.tell,
+        status.show,
     )
-    with in_words():
-        run_connected(url, program, ending)
-    status.end("ended")
+    with errors_as_click():
+        run_connected(url, program, exit_signal)
+    status.finish("ended")
 
 
 if __name__ == "__main__":

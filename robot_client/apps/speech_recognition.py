@@ -1,8 +1,7 @@
-"""Finds the words a robot obeys in sound, by PocketSphinx and the English model it comes with, on this computer.
+"""Recognises command words in sound, by PocketSphinx and its English model, on this computer.
 
-What is spoken is cut out between two silences, and recognised as one of the words or as one of many others that are
-there to be taken for what is neither: a word has to be nearer than all of them. What is too short or too long to be a
-word, or has no voice in it, is noise.
+Speech between two silences is recognised as a command word or as one of many other words, which absorb everything else:
+a command word must match better than all of them. Speech that is too short, too long or without a voice is noise.
 """
 
 from __future__ import annotations
@@ -17,37 +16,37 @@ from robot_client.apps.audio import BLOCK, RATE
 from robot_client.apps.command_words import CommandWord
 
 BEFORE = 8
-"""Blocks of silence before speech that belong to it: recognition needs some, and words begin softly."""
+"""Blocks of silence before speech that are kept, because words begin softly."""
 
 BEGINS = 2
-"""Blocks of speech in a row by which it begins."""
+"""Successive blocks of speech at which speech begins."""
 
 ENDS = 6
-"""Blocks of silence in a row by which it has ended. Less would cut words at their closed consonants."""
+"""Successive blocks of silence at which speech ends. Fewer would cut words at plosives."""
 
 SHORTEST, LONGEST = 6, 60
-"""Blocks that a word has, without the silence around it."""
+"""Length of a word in blocks, without silence."""
 
 FAINTEST = 60.0
-"""The least of a sample, on average, that is speech."""
+"""Least RMS amplitude of speech."""
 
 LOUDER = 3.0
-"""Times as loud as the quietest of the last moments speech is at least."""
+"""Least ratio of the amplitudes of speech and background."""
 
 MOMENTS = 70
-"""Blocks of which the quietest tells how loud it is where nobody speaks."""
+"""Blocks whose quietest is the background."""
 
 VOICED = 3
-"""Blocks with a voice in them that a word has at least."""
+"""Least number of voiced blocks in a word."""
 
 PERIODIC = 0.6
-"""Of a block's energy, what has to come again at the pitch of a voice for it to be one."""
+"""Least autocorrelation at the pitch of a voice."""
 
 PITCH = (80, 400)
-"""Hertz of voices."""
+"""Pitch of voices, Hz."""
 
 FAVOUR = {CommandWord.STOP: 10_000}
-"""How much likelier a word is than each of the others. A stop nobody said does less harm than one not heard."""
+"""Weight of a word against each other word. A false stop does less harm than a missed one."""
 
 USUAL_FAVOUR = 10
 
@@ -69,66 +68,70 @@ you young
 WORDS = {word.value: word for word in CommandWord}
 
 
-class Loudness:
-    """Tells what is louder than silence.
+class LoudnessDetector:
+    """Detects blocks that are louder than the background.
 
-    A detector of speech that has heard a clap takes what is quiet after it for speech, for seconds.
+    After a clap, the speech detector alone takes quiet blocks for speech for seconds.
     """
 
     def __init__(self) -> None:
         self._last: deque[float] = deque(maxlen=MOMENTS)
 
     def is_loud(self, data: bytes) -> bool:
-        """Whether a block is."""
+        """Whether a block is loud."""
         loudness = _loudness(data)
         self._last.append(loudness)
         return loudness >= FAINTEST and loudness >= LOUDER * min(self._last)
 
 
-class Cutter:
-    """Cuts what is spoken out of sound: block after block.
+class SpeechSegmenter:
+    """Cuts speech out of a sequence of blocks.
 
-    :param speaks: whether somebody speaks in a block
+    :param is_speech: whether a block is speech
     """
 
-    def __init__(self, speaks: Any) -> None:
-        self._speaks = speaks
+    def __init__(self, is_speech: Any) -> None:
+        self._is_speech = is_speech
         self._blocks: deque[bytes] = deque(maxlen=BEFORE + BEGINS)
-        self._spoken: list[bytes] = []
+        self._segment: list[bytes] = []
         self._run = 0
         self._in_speech = False
 
-    def take(self, data: bytes) -> list[bytes] | None:
-        """What was spoken, as blocks, when it has ended with this one."""
-        speaks = bool(self._speaks(data))
+    def add(self, data: bytes) -> list[bytes] | None:
+        """Add a block; returns the speech that ends with it, as blocks."""
+        is_speech = bool(self._is_speech(data))
         if not self._in_speech:
             self._blocks.append(data)
-            self._run = self._run + 1 if speaks else 0
+            self._run = self._run + 1 if is_speech else 0
             if self._run >= BEGINS:
-                self._in_speech, self._run, self._spoken = True, 0, list(self._blocks)
+                self._in_speech, self._run, self._segment = True, 0, list(self._blocks)
             return None
-        if len(self._spoken) <= BEFORE + LONGEST + ENDS:  # of a speech nothing more is needed than its length
-            self._spoken.append(data)
-        self._run = 0 if speaks else self._run + 1
+        if (
+            len(self._segment) <= BEFORE + LONGEST + ENDS
+        ):  # of a speech nothing more is needed than its length
+            self._segment.append(data)
+        self._run = 0 if is_speech else self._run + 1
         if self._run < ENDS:
             return None
         self._in_speech, self._run = False, 0
         self._blocks.clear()
-        self._blocks.extend(self._spoken[-ENDS:])
-        return self._spoken
+        self._blocks.extend(self._segment[-ENDS:])
+        return self._segment
 
 
 class Recognizer:
-    """Finds words, one for each time somebody speaks.
+    """Recognises one word in each piece of speech.
 
-    :raises click.ClickException: there is no PocketSphinx
+    :raises click.ClickException: PocketSphinx is not installed
     """
 
     def __init__(self) -> None:
         try:
             from pocketsphinx import Decoder, Vad
         except ImportError as error:
-            raise click.ClickException(f"words take pocketsphinx: pip install '.[apps]' ({error})") from None
+            raise click.ClickException(
+                f"voice control needs pocketsphinx: pip install '.[apps]' ({error})"
+            ) from None
         self._decoder: Any = Decoder(lm=None, samprate=RATE, lw=1.0, loglevel="FATAL")
         known = [f"/{FAVOUR.get(word, USUAL_FAVOUR)}/ {word.value}" for word in CommandWord] + [
             f"/1/ {word}" for word in OTHERS
@@ -138,27 +141,27 @@ class Recognizer:
         )
         self._decoder.activate_search("words")
         self._vad: Any = Vad(Vad.MEDIUM_STRICT, RATE, BLOCK)
-        self._loudness = Loudness()
-        self._cutter = Cutter(self._speaks)
+        self._loudness = LoudnessDetector()
+        self._segmenter = SpeechSegmenter(self._is_speech)
 
-    def hear(self, data: bytes) -> Iterator[tuple[CommandWord, float]]:
-        """Words found with one block more, and how many seconds before its end each ended."""
-        spoken = self._cutter.take(data)
-        if spoken is None or not may_be_word(spoken):
+    def recognize(self, data: bytes) -> Iterator[tuple[CommandWord, float]]:
+        """Add a block; yields recognised words, and how many seconds before the block's end each ended."""
+        segment = self._segmenter.add(data)
+        if segment is None or not may_be_word(segment):
             return
         decoder = self._decoder
         known = decoder.get_cmn(False)
         decoder.start_utt()
-        decoder.process_raw(b"".join(spoken))
+        decoder.process_raw(b"".join(segment))
         decoder.end_utt()
         found = decoder.hyp()
         if found is not None and found.hypstr in WORDS:
             yield WORDS[found.hypstr], ENDS * BLOCK
         else:
-            # Of what is no word nothing is learnt about the voice and the room.
+            # Other sound must not adapt the model to voice and room.
             decoder.set_cmn(known)
 
-    def _speaks(self, data: bytes) -> bool:
+    def _is_speech(self, data: bytes) -> bool:
         loud = self._loudness.is_loud(data)
         return bool(self._vad.is_speech(data)) and loud
 
@@ -169,14 +172,14 @@ def _loudness(data: bytes) -> float:
     return float(np.sqrt(np.square(np.frombuffer(data, "<i2").astype(np.float64)).mean()))
 
 
-def may_be_word(spoken: list[bytes]) -> bool:
-    """Whether it is as long as words are, and has a voice in it."""
-    length = len(spoken) - BEFORE - ENDS
-    return SHORTEST <= length <= LONGEST and sum(map(has_voice, spoken)) >= VOICED
+def may_be_word(segment: list[bytes]) -> bool:
+    """Whether speech has the length of a word and enough voice."""
+    length = len(segment) - BEFORE - ENDS
+    return SHORTEST <= length <= LONGEST and sum(map(has_voice, segment)) >= VOICED
 
 
 def has_voice(data: bytes) -> bool:
-    """Whether a block comes again and again at the pitch of a voice, as no noise does."""
+    """Whether a block is periodic at the pitch of a voice, unlike noise."""
     import numpy as np
 
     samples = np.frombuffer(data, "<i2").astype(np.float64)
@@ -185,7 +188,7 @@ def has_voice(data: bytes) -> bool:
     again = np.fft.irfft(spectrum * spectrum.conj())[: len(samples)]
     if again[0] <= 0:
         return False
-    # Of what is later by a lag there is less: that much it could be at most.
+    # With a lag fewer samples overlap: normalise by their number.
     shares = again / again[0] * len(samples) / np.arange(len(samples), 0, -1)
     first, last = RATE // PITCH[1], RATE // PITCH[0]
     return bool(shares[first : last + 1].max() >= PERIODIC)

@@ -1,9 +1,9 @@
 """Moves a robot by words: ``python -m robot_client.apps.voice``.
 
-*right*, *left*, *ahead*, *back*, *faster*, *slower*, *stop*, recognised on this computer. Each moves the robot for a
-moment only, then it stands; said again it goes on. *stop* is zero at once; where a zero would not be obeyed (without
-control, while somebody suppresses the topic, or where the robot is late) it is the relay's stop, which lasts until
-somebody resumes the robot. What is none of these words moves nothing.
+*right*, *left*, *ahead*, *back*, *faster*, *slower*, *stop*, recognised on this computer. Each word moves the robot for
+a moment; repeating it continues the motion. *stop* is zero velocity at once. If zero velocity would not be obeyed
+(without control, while the topic is suppressed, or when the robot does not answer), it is the relay's stop, which lasts
+until the robot is resumed.
 """
 
 from __future__ import annotations
@@ -20,36 +20,34 @@ from typing import NamedTuple, Protocol
 
 import click
 
+from relay_protocol.clocks import now as seconds_since_boot
 from robot_client.apps import audio
-from robot_client.apps.clock import now as since_start
-from robot_client.apps.command_words import MOVES, SECONDS, CommandWord, WordCommands
-from robot_client.apps.connection import RosbridgeConnection, in_words, token
-from robot_client.apps.driver import STILL, Driver, MaximumSpeeds, StopNotice
-from robot_client.apps.options import driving
-from robot_client.apps.reconnect import Ending, run_connected
+from robot_client.apps.command_words import MOTION_WORDS, SECONDS, CommandWord, WordCommands
+from robot_client.apps.connection import RosbridgeConnection, access_token, errors_as_click
+from robot_client.apps.driver import ZERO_VELOCITY, Driver, MaximumSpeeds, StopRequest
+from robot_client.apps.program import ExitSignal, StatusLine, driving, run_connected
 from robot_client.apps.speech_recognition import Recognizer
-from robot_client.apps.status_line import StatusLine
-from robot_client.numbers import Number
+from robot_client.command_line import Number
 
 NAME = "voice"
-LOOK = 0.02
-EVERY = 0.05
-"""Seconds from one command to the next."""
+POLL_SECONDS = 0.02
+COMMAND_SECONDS = 0.05
+"""Interval of commands, seconds."""
 
-STALE = 1.0
-"""Seconds after which a word counts no more: held up on its way, or without control. *stop* is never too old."""
+MAX_WORD_AGE = 1.0
+"""Seconds after which a word is ignored. *stop* never expires."""
 
-KEEP = 15.0
-"""Seconds without a word after which control is given back."""
+RELEASE_AFTER = 15.0
+"""Seconds without a word after which control is released."""
 
-WAITING = 16
-"""Words that wait to be done, at most."""
+MAX_WAITING_WORDS = 16
+"""Most words that wait."""
 
 
 class RecognisedWord(NamedTuple):
-    """A word.
+    """A recognised word.
 
-    :ivar at: seconds, suspends included, when it ended
+    :ivar at: seconds, including suspends, when it ended
     """
 
     word: CommandWord
@@ -57,60 +55,60 @@ class RecognisedWord(NamedTuple):
 
 
 class SpeechSource(Protocol):
-    """Finds words in sound."""
+    """Recognises words in sound."""
 
-    def hear(self, data: bytes) -> Iterable[tuple[CommandWord, float]]:
-        """Words found with one block more, and how many seconds before its end each ended."""
+    def recognize(self, data: bytes) -> Iterable[tuple[CommandWord, float]]:
+        """Add a block; yields words, and how many seconds before the block's end each ended."""
 
 
 class RecognitionThread(Thread):
-    """Hears, in a thread of its own.
+    """Recognises words in a thread of its own.
 
     :param blocks: of sound
-    :ivar ended: whether there is nothing more to hear
+    :ivar ended: whether the sound has ended
     """
 
-    def __init__(self, blocks: Iterable[audio.Block], ear: SpeechSource) -> None:
+    def __init__(self, blocks: Iterable[audio.Block], recognizer: SpeechSource) -> None:
         super().__init__(daemon=True)
         self.ended = False
         self._blocks = blocks
-        self._ear = ear
-        self._heard: deque[RecognisedWord] = deque(maxlen=WAITING)
+        self._recognizer = recognizer
+        self._recognised: deque[RecognisedWord] = deque(maxlen=MAX_WAITING_WORDS)
 
     def run(self) -> None:
-        """Hear all there is."""
+        """Process all blocks."""
         try:
             for block in self._blocks:
-                for word, before in self._ear.hear(block.data):
-                    self._heard.append(RecognisedWord(word, block.at - before))
+                for word, before in self._recognizer.recognize(block.data):
+                    self._recognised.append(RecognisedWord(word, block.at - before))
         finally:
             self.ended = True
 
-    def heard(self) -> Iterator[RecognisedWord]:
-        """The words since this was asked last."""
-        while self._heard:
-            yield self._heard.popleft()
+    def take_words(self) -> Iterator[RecognisedWord]:
+        """Words recognised since the last call."""
+        while self._recognised:
+            yield self._recognised.popleft()
 
 
 class Words(Protocol):
-    """Where words come from: :class:`RecognitionThread`."""
+    """Source of words: :class:`RecognitionThread`."""
 
     ended: bool
 
-    def heard(self) -> Iterator[RecognisedWord]:
-        """The words since this was asked last."""
+    def take_words(self) -> Iterator[RecognisedWord]:
+        """Words recognised since the last call."""
 
 
 class VoiceControl:
-    """Does what words say.
+    """Drives a robot by words.
 
-    :param words: where they come from
-    :param orders: what they mean
+    :param words: source of words
+    :param orders: their meaning
     :param topic: of the commands
-    :param wanted: the fastest, within what the robot allows
-    :param latch: whether *stop* is the relay's stop always
-    :param tell: takes the state in a few words, and what changes all the time
-    :param clock: seconds, suspends included
+    :param wanted: maximum speeds; the robot's own limits apply too
+    :param latch: whether *stop* is always the relay's stop
+    :param report: takes the state, and details that change all the time
+    :param clock: seconds, including suspends
     """
 
     def __init__(
@@ -120,136 +118,134 @@ class VoiceControl:
         topic: str,
         wanted: MaximumSpeeds,
         latch: bool,
-        tell: Callable[[str, str], None],
-        clock: Callable[[], float] = since_start,
+        report: Callable[[str, str], None],
+        clock: Callable[[], float] = seconds_since_boot,
     ) -> None:
         self._words = words
         self._orders = orders
         self._topic = topic
         self._wanted = wanted
         self._latch = latch
-        self._tell = tell
+        self._report = report
         self._clock = clock
         self._driver: Driver
-        self._asked = StopNotice()
-        self._told_of_stop = ""
-        self._waits: RecognisedWord | None = None
+        self._stop_request = StopRequest()
+        self._shown_stop_text = ""
+        self._waiting_word: RecognisedWord | None = None
         """The word that waits for control."""
         self._sent = -math.inf
-        self._spoken = -math.inf
-        self._moves = False
+        self._last_word_at = -math.inf
+        self._moving = False
 
-    def begin(self, line: RosbridgeConnection) -> None:
-        """There is a line. What was said before does not count by it; but *stop* does."""
-        self._forget()
-        self._spoken = self._clock()
-        if CommandWord.STOP in {heard.word for heard in self._words.heard()}:
-            self._asked.ask()
-        self._driver = Driver(line, self._topic, NAME, self._clock, self._asked)
-        self._tell("listening", "")
-        self._told_of_stop = ""
-        if self._asked.asked:
-            self._tell_of_stop()
+    def begin(self, connection: RosbridgeConnection) -> None:
+        """A connection was made. Earlier words are ignored, except *stop*."""
+        self._cancel_words()
+        self._last_word_at = self._clock()
+        if CommandWord.STOP in {recognised.word for recognised in self._words.take_words()}:
+            self._stop_request.request()
+        self._driver = Driver(connection, self._topic, NAME, self._clock, self._stop_request)
+        self._report("listening", "")
+        self._shown_stop_text = ""
+        if self._stop_request.pending:
+            self._show_stop()
 
     def step(self) -> bool:
         """Take what comes within a moment, and do what was said."""
-        ended = self._words.ended  # what was said last is heard below
-        self._driver.hear(LOOK)
+        ended = self._words.ended  # the last words are taken below
+        self._driver.poll(POLL_SECONDS)
         now = self._clock()
-        for heard in self._words.heard():
-            self._do(heard, now)
-        if self._waits is not None:
-            self._wait(self._waits, now)
+        for recognised in self._words.take_words():
+            self._do(recognised, now)
+        if self._waiting_word is not None:
+            self._wait(self._waiting_word, now)
         self._move(now)
-        if self._asked.words != self._told_of_stop:
-            self._tell_of_stop()
-        if self._driver.in_control and not self._moves and now - self._spoken > KEEP:
-            self._driver.give_back()
-            self._tell("nothing was said for long: control given back", "")
-        return not ended or self._moves or self._waits is not None or self._asked.asked
+        if self._stop_request.text != self._shown_stop_text:
+            self._show_stop()
+        if self._driver.in_control and not self._moving and now - self._last_word_at > RELEASE_AFTER:
+            self._driver.release_control()
+            self._report("no words for a while: control released", "")
+        return not ended or self._moving or self._waiting_word is not None or self._stop_request.pending
 
     def leave(self) -> None:
-        """Stand still, and let others drive."""
-        self._forget()
-        self._driver.give_back()
+        """Stop the robot and release control."""
+        self._cancel_words()
+        self._driver.release_control()
 
     def lost(self, why: str, seconds: float) -> None:
-        """Say so; the robot stands by itself."""
-        self._forget()
-        self._tell(f"{why}; again in {seconds:.1f} s", "")
+        """Report it. The robot stops by itself."""
+        self._cancel_words()
+        self._report(f"{why}; again in {seconds:.1f} s", "")
 
-    def _forget(self) -> None:
-        self._orders.still()
-        self._waits = None
-        self._moves = False
+    def _cancel_words(self) -> None:
+        self._orders.cancel()
+        self._waiting_word = None
+        self._moving = False
 
-    def _do(self, heard: RecognisedWord, now: float) -> None:
-        word, driver = heard.word, self._driver
-        self._spoken = now
+    def _do(self, recognised: RecognisedWord, now: float) -> None:
+        word, driver = recognised.word, self._driver
+        self._last_word_at = now
         if word is CommandWord.STOP:
             self._stop()
-        elif now - heard.at > STALE:
-            self._tell(f"{word.value}: heard too late, not done", "")
-        elif word not in MOVES:
-            self._orders.say(word, now)
-            self._tell(word.value, "")
+        elif now - recognised.at > MAX_WORD_AGE:
+            self._report(f"{word.value}: too late, ignored", "")
+        elif word not in MOTION_WORDS:
+            self._orders.handle(word, now)
+            self._report(word.value, "")
         elif driver.in_control:
             self._begin(word, now)
         else:
-            self._waits = heard
-            driver.take()
+            self._waiting_word = recognised
+            driver.request_control()
 
     def _stop(self) -> None:
         driver = self._driver
-        self._forget()
-        if self._latch or not driver.in_control or driver.suppressed or driver.late:
+        self._cancel_words()
+        if self._latch or not driver.in_control or driver.suppressed or driver.unresponsive:
             driver.stop()
         else:
-            # Also where nothing was said that moves: whoever drove before may have left the robot moving.
-            driver.drive(STILL)
-            self._tell("stop", "")
+            # Also without a motion of this program: an earlier driver may have left the robot moving.
+            driver.drive(ZERO_VELOCITY)
+            self._report("stop", "")
 
-    def _tell_of_stop(self) -> None:
-        self._told_of_stop = self._asked.words
-        self._tell(self._told_of_stop, "")
+    def _show_stop(self) -> None:
+        self._shown_stop_text = self._stop_request.text
+        self._report(self._shown_stop_text, "")
 
-    def _wait(self, heard: RecognisedWord, now: float) -> None:
+    def _wait(self, recognised: RecognisedWord, now: float) -> None:
         driver = self._driver
-        stale = now - heard.at > STALE
+        stale = now - recognised.at > MAX_WORD_AGE
         if driver.in_control and not stale:
-            self._waits = None
-            self._begin(heard.word, now)
-        elif driver.said or stale:
-            self._waits = None
+            self._waiting_word = None
+            self._begin(recognised.word, now)
+        elif driver.refusal or stale:
+            self._waiting_word = None
             why = (
-                driver.said
-                or driver.obstacle
-                or ("no control" if not driver.in_control else "heard too late")
+                driver.refusal or driver.blocked_by or ("no control" if not driver.in_control else "too late")
             )
-            self._tell(f"{heard.word.value}: not done: {why}", "")
+            self._report(f"{recognised.word.value}: not done: {why}", "")
 
     def _begin(self, word: CommandWord, now: float) -> None:
-        why = self._driver.obstacle or ("the robot does not answer" if self._driver.late else "")
+        why = self._driver.blocked_by or ("the robot does not answer" if self._driver.unresponsive else "")
         if why:
-            self._tell(f"{word.value}: not done: {why}", "")
+            self._report(f"{word.value}: not done: {why}", "")
         else:
-            self._orders.say(word, now)
+            self._orders.handle(word, now)
             self._sent = -math.inf
-            self._tell(word.value, "")
+            self._report(word.value, "")
 
     def _move(self, now: float) -> None:
         driver = self._driver
-        if driver.obstacle or driver.late or not driver.in_control:
-            self._orders.still()
+        if driver.blocked_by or driver.unresponsive or not driver.in_control:
+            self._orders.cancel()
         command = self._orders.command(self._wanted.within(driver.limits), now)
         if command is None:
-            if self._moves:
-                driver.still()
-                self._tell("stands", "")
-        elif now - self._sent >= EVERY:
+            if self._moving:
+                driver.halt()
+                self._report("stands", "")
+        elif now - self._sent >= COMMAND_SECONDS:
             self._sent = now
             driver.drive(command)
-        self._moves = command is not None
+        self._moving = command is not None
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -258,17 +254,17 @@ class VoiceControl:
     "--wav",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Hear a file: 16000 Hz, 16 bits, one channel.",
+    help="Use a WAV file: 16000 Hz, 16 bits, one channel.",
 )
-@click.option("--pcm", is_flag=True, help="Hear the standard input: raw samples of the same form.")
-@click.option("--microphone", metavar="NAME", help="Which microphone, by its number or a part of its name.")
-@click.option("--latch", is_flag=True, help="Have 'stop' stop the robot until somebody resumes it, always.")
+@click.option("--pcm", is_flag=True, help="Use the standard input: raw samples of the same format.")
+@click.option("--microphone", metavar="NAME", help="Number or part of the name of the microphone.")
+@click.option("--latch", is_flag=True, help="'stop' always stops the robot until it is resumed.")
 @click.option(
     "--seconds",
     type=Number(0.3, 5.0),
     default=SECONDS,
     show_default=True,
-    help="How long a word acts.",
+    help="Duration of a word's motion.",
 )
 def main(
     url: str,
@@ -283,10 +279,10 @@ def main(
 ) -> None:
     """Move the robot at URL (ws://relay/robots/NAME) by words: right, left, ahead, back, faster, slower, stop.
 
-    They are heard by the microphone, if nothing else is said, and recognised on this computer. Each acts for a
-    moment, then the robot stands. 'stop' is zero at once; without control it stops the robot until it is resumed.
+    The default source is the microphone; words are recognised on this computer. Each word moves the robot for a moment.
+    'stop' is zero velocity at once; without control it stops the robot until it is resumed.
 
-    The token comes from the variable SWITCHBOARD_TOKEN. SIGINT and SIGTERM end it.
+    The access token is read from SWITCHBOARD_TOKEN. SIGINT and SIGTERM end the program.
 
     \b
     Examples:
@@ -296,20 +292,20 @@ def main(
       arecord -q -t raw -f S16_LE -r 16000 -c 1 | python -m robot_client.apps.voice $ROBOT --pcm
     """
     if (wav is not None) + pcm + (microphone is not None) > 1:
-        raise click.UsageError("one of --wav, --pcm and --microphone is enough")
-    token()
-    tape = audio.AudioBuffer(_source(wav, pcm, microphone))
-    listening = RecognitionThread(tape, Recognizer())
-    ending = Ending()
+        raise click.UsageError("use only one of --wav, --pcm and --microphone")
+    access_token()
+    sound = audio.AudioBuffer(_source(wav, pcm, microphone))
+    recognition = RecognitionThread(sound, Recognizer())
+    exit_signal = ExitSignal()
     status = StatusLine(sys.stdout, time.monotonic)
     program = VoiceControl(
-        listening, WordCommands(seconds), topic, MaximumSpeeds(speed, turn), latch, status.tell
+        recognition, WordCommands(seconds), topic, MaximumSpeeds(speed, turn), latch, status.show
     )
-    tape.start()
-    listening.start()
-    with in_words():
-        run_connected(url, program, ending)
-    status.end(tape.broken or "ended")
+    sound.start()
+    recognition.start()
+    with errors_as_click():
+        run_connected(url, program, exit_signal)
+    status.finish(sound.error or "ended")
 
 
 def _source(wav: Path | None, pcm: bool, microphone: str | None) -> Iterator[bytes]:

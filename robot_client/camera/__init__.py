@@ -1,9 +1,10 @@
-"""Pictures of this robot's cameras: read, edited, encoded, sent at the pace of the uplink.
+"""Frames of this robot's cameras: captured, transformed, encoded, and sent at the rate that the uplink
+carries.
 
-The daemon's side is :mod:`~robot_client.camera.service` (which cameras there are, what the relay wants) and
-:mod:`~robot_client.camera.supervisor` (the process); the rest runs in the process,
-    :mod:`~robot_client.camera.main`. What
-needs numpy and OpenCV is imported there, after :func:`check_installed`.
+In the daemon run :mod:`~robot_client.camera.service` (the list of cameras, the relay's requests) and
+:mod:`~robot_client.camera.supervisor` (the camera process). Everything else runs in that process,
+:mod:`~robot_client.camera.main`. Modules that need numpy and OpenCV are imported there, after
+    :func:`check_installed`.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ from relay_protocol.errors import Unavailable
 
 INSTALL = "pip install 'robot-switchboard[video]'"
 
-_NEEDED = {"numpy": "numpy", "cv2": "OpenCV"}
+_REQUIRED = {"numpy": "numpy", "cv2": "OpenCV"}
 
 
 def check_installed() -> None:
-    """See to it that the rest of this package can be imported.
+    """Check that the modules which need numpy and OpenCV can be imported.
 
-    :raises Unavailable: names what is missing or can't be loaded, and how it is installed
+    :raises Unavailable: names the package that can't be loaded, and how to install it
     """
-    for module, name in _NEEDED.items():
+    for module, name in _REQUIRED.items():
         try:
             import_module(module)
         except ImportError as error:
-            raise Unavailable(f"this robot shows no pictures without {name}: {error} ({INSTALL})") from None
+            raise Unavailable(f"this robot can't show cameras without {name}: {error} ({INSTALL})") from None

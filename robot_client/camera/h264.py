@@ -1,6 +1,6 @@
-"""H.264 for thin links, by x264 in PyAV: no picture waits for a later one, and each leaves as it is made.
+"""H.264 for slow links, by x264 in PyAV, without B-frames and without delay.
 
-Imported when it is asked for: a robot may be without PyAV.
+Imported only when requested, since PyAV may be missing.
 """
 
 from __future__ import annotations
@@ -15,55 +15,57 @@ from relay_protocol.errors import Unavailable
 from robot_client.camera import INSTALL
 from robot_client.camera.formats import Pixels
 
-_USUAL = 80
-_BITS = 0.2
-"""Bits for each pixel at that quality: a fifth or so of the JPEG's."""
-_HALVED = 20
-"""Steps of quality that halve or double the bits."""
-_LEAST = 16_000
-"""Bits per second for the smallest pictures; x264 counts in thousands."""
-_RATES = (5.0, 60.0)
-"""Least and most pictures per second that are planned with."""
-_GUESS = 15.0
-"""Pictures per second, where nobody knows."""
+_BASE_QUALITY = 80
+_BITS_PER_PIXEL = 0.2
+"""At the base quality: about a fifth of JPEG's."""
+_QUALITY_OCTAVE = 20
+"""Steps of quality that double the bits."""
+_MIN_BIT_RATE = 16_000
+"""Bits per second; x264 counts in thousands."""
+_FPS_RANGE = (5.0, 60.0)
+"""Least and most frames per second that are assumed."""
+_DEFAULT_FPS = 15.0
 _KEY_SECONDS = 10
-"""Between two key frames nobody asked for, when they come at the rate that was planned with."""
+"""Seconds between unrequested key frames at the assumed rate."""
 _BUFFER_SECONDS = 0.5
-"""How much of the rate one picture may use up: what a key frame holds the link."""
-_FINEST = 18
-"""Quantiser under which nobody sees a difference; a camera that shows nothing new needs less than its rate."""
+"""Seconds of the bit rate that one frame may use: so long a key frame occupies the link."""
+_MIN_QUANTISER = 18
+"""Quantiser below which no difference is visible; a static scene needs less than its bit rate."""
 _BT601 = 6
-"""SMPTE 170M in T-REC-H.273: what OpenCV turns colours into, and what viewers would else guess from the size."""
+"""SMPTE 170M in ITU-T H.273: OpenCV's conversion. Without it, players guess from the size."""
 _LIMITED = 1
 """Y from 16 to 235."""
 
 
-class H264:
-    """One stream of H.264 (Annex B), its parameter sets before every key frame. See :class:`~.encoding.Encoder`.
+class H264Encoder:
+    """One stream of H.264 (Annex B), with parameter sets before every key frame. See
+    :class:`~.encoder.Encoder`.
 
     :param width: pixels, even
     :param height: pixels, even
-    :param fps: pictures per second that may be expected; 0 if nobody knows
-    :raises Unavailable: PyAV or its x264 is not there, or the size is odd
+    :param fps: expected frames per second; 0 if unknown
+    :raises Unavailable: PyAV has no x264, or the size is odd
     """
 
     def __init__(self, width: int, height: int, fps: float) -> None:
         if width % 2 or height % 2:
-            raise Unavailable(f"H.264 has no pictures of {width}×{height} pixels; each side must be even")
+            raise Unavailable(f"H.264 can't encode {width}×{height} pixels; each side must be even")
         self._size = (height, width)
-        self._fps = min(max(fps or _GUESS, _RATES[0]), _RATES[1])
+        self._fps = min(max(fps or _DEFAULT_FPS, _FPS_RANGE[0]), _FPS_RANGE[1])
         self._count = 0
-        self._most = 0
+        self._max_quality = 0
         self._context: av.VideoCodecContext | None = None
         try:
             av.Codec("libx264", "w")
         except av.codec.codec.UnknownCodecError:
-            raise Unavailable(f"this robot's PyAV has no x264; another one has ({INSTALL})") from None
+            raise Unavailable(f"this robot's PyAV has no x264; install one that has it ({INSTALL})") from None
 
     def encode(self, pixels: Pixels, quality: int, key: bool) -> tuple[bytes, bool]:
-        """See :class:`~.encoding.Encoder`. Less quality needs no key frame, the most so far does."""
+        """See :class:`~.encoder.Encoder`. A quality above all earlier ones starts with a key frame."""
         if pixels.shape[:2] != self._size:
-            raise Unavailable("the camera's pictures changed their size")
+            raise Unavailable(
+                f"the frame does not have the encoder's size of {self._size[1]}×{self._size[0]} pixels"
+            )
         if pixels.ndim == 2:
             pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR).astype(pixels.dtype, copy=False)
         planes = cv2.cvtColor(pixels, cv2.COLOR_BGR2YUV_I420).astype(pixels.dtype, copy=False)
@@ -71,22 +73,23 @@ class H264:
         frame.pts = self._count
         frame.pict_type = PictureType.I if key else PictureType.NONE
         self._count += 1
-        if self._context is None or quality > self._most:
-            self._context, self._most = self._opened(quality), quality
+        if self._context is None or quality > self._max_quality:
+            self._context, self._max_quality = self._open(quality), quality
         self._context.bit_rate = self._rate(quality)
         try:
             packets = self._context.encode(frame)
         except av.FFmpegError as error:
-            raise Unavailable(f"x264 can't encode the picture: {error.strerror}") from None
+            raise Unavailable(f"x264 can't encode the frame: {error.strerror}") from None
         return b"".join(bytes(packet) for packet in packets), any(packet.is_keyframe for packet in packets)
 
     def _rate(self, quality: int) -> int:
         """Bits per second."""
         height, width = self._size
-        return max(_LEAST, int(width * height * self._fps * _BITS * 2 ** ((quality - _USUAL) / _HALVED)))
+        bits = _BITS_PER_PIXEL * 2 ** ((quality - _BASE_QUALITY) / _QUALITY_OCTAVE)
+        return max(_MIN_BIT_RATE, int(width * height * self._fps * bits))
 
-    def _opened(self, quality: int) -> av.VideoCodecContext:
-        """A new beginning: x264 follows a rate that changes, but to none above the one it was opened with."""
+    def _open(self, quality: int) -> av.VideoCodecContext:
+        """Open a codec context. x264 follows a changed bit rate, but not above the one it was opened with."""
         context = av.VideoCodecContext.create("libx264", "w")
         context.height, context.width = self._size
         context.pix_fmt = "yuv420p"
@@ -95,21 +98,21 @@ class H264:
         context.time_base = 1 / context.framerate
         context.gop_size = round(self._fps * _KEY_SECONDS)
         context.max_b_frames = 0
-        context.qmin = _FINEST
-        # One thread: a picture in slices is larger, and other streams want the cores too.
+        context.qmin = _MIN_QUANTISER
+        # One thread: slices make frames larger, and other streams need the cores too.
         context.thread_count = 1
-        # A rate that is the most at once: only then x264 follows when it changes.
+        # The bit rate is also the maximum: only then x264 follows when it changes.
         context.bit_rate = rate = self._rate(quality)
         context.options = {
             "preset": "ultrafast",
             "tune": "zerolatency",
             "forced-idr": "1",
             "maxrate": str(rate),
-            "bufsize": str(int(self._rate(_USUAL) * _BUFFER_SECONDS)),
+            "bufsize": str(int(self._rate(_BASE_QUALITY) * _BUFFER_SECONDS)),
             "x264-params": "annexb=1:repeat-headers=1",
         }
         try:
             context.open()
         except av.FFmpegError as error:
-            raise Unavailable(f"x264 makes no pictures of this size: {error.strerror}") from None
+            raise Unavailable(f"x264 can't encode this size: {error.strerror}") from None
         return context

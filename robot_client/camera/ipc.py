@@ -1,4 +1,4 @@
-"""What the daemon and its camera process tell each other: one JSON object per line on two pipes."""
+"""Messages between the daemon and its camera process: one JSON object per line on two pipes."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from relay_protocol.message import lower_tag
 
 
 class _IpcMessage(
-    msgspec.Struct, tag_field="line", tag=lower_tag, omit_defaults=True, frozen=True, kw_only=True
+    msgspec.Struct, tag_field="op", tag=lower_tag, omit_defaults=True, frozen=True, kw_only=True
 ):
     pass
 
 
 class CameraSettings(_IpcMessage, frozen=True, kw_only=True):
-    """The daemon's first word.
+    """First message of the daemon.
 
-    :param address: ``host:port`` of the relay, where ``open`` says none
+    :param address: ``host:port`` of the relay, used if a stream has none
     :param tls: whether the link to it is TLS
-    :param ca: PEM file of the only authorities trusted, empty for the system's
-    :param server_name: name the certificate must bear, empty for the host
+    :param ca: PEM file of the only trusted authorities, empty for the system's
+    :param server_name: name in the relay's certificate, empty for the host
     :param node: name of the node that subscribes to cameras
-    :param streams: most of them at a time
-    :param target: delay to stay under, seconds
+    :param streams: most streams at a time
+    :param target: longest delay that rate control aims for, seconds
     """
 
     address: str
@@ -36,15 +36,15 @@ class CameraSettings(_IpcMessage, frozen=True, kw_only=True):
 
 
 class OpenStream(_IpcMessage, frozen=True, kw_only=True):
-    """Dial, join with this ticket, and show this camera there.
+    """Dial, join with this ticket, and stream this camera.
 
     :param stream: name of the stream
-    :param camera: as the relay calls it
+    :param camera: the relay's name for the camera
     :param topic: to subscribe to; empty for a camera without ROS
     :param compressed: whether its messages are ``CompressedImage``
-    :param source: of a camera without ROS, where there is no topic; with neither there is no such camera
+    :param source: of a camera without ROS, if there is no topic; without both there is no such camera
     :param address: ``host:port`` to dial; empty for the address of the control link
-    :param heartbeat: seconds, as the control link agreed
+    :param heartbeat: seconds, as agreed on the control link
     """
 
     stream: str
@@ -59,39 +59,39 @@ class OpenStream(_IpcMessage, frozen=True, kw_only=True):
 
 
 class CloseStream(_IpcMessage, frozen=True, kw_only=True):
-    """Nobody watches this stream any more.
+    """End a stream.
 
-    :param why: for the relay
+    :param reason: for the relay
     """
 
     stream: str
-    why: str
+    reason: str
 
 
-class NoFrames(_IpcMessage, frozen=True, kw_only=True):
-    """Topics that say nothing from now on, all there are; others do again."""
+class InhibitTopics(_IpcMessage, frozen=True, kw_only=True):
+    """All topics that are inhibited now."""
 
     topics: list[str]
 
 
 class CameraAlive(_IpcMessage, frozen=True, kw_only=True):
-    """The process lives; said every second."""
+    """The process is alive; sent every second."""
 
 
 class StreamAccepted(_IpcMessage, frozen=True, kw_only=True):
-    """The process has read that it is to open this stream."""
+    """The process has received :class:`OpenStream`."""
 
     stream: str
 
 
 class CameraSeen(_IpcMessage, frozen=True, kw_only=True):
-    """What a camera's pictures are like.
+    """Format and rate of a camera.
 
-    :param encoding: of the last picture
-    :param width: of the last picture, pixels
-    :param height: of the last picture, pixels
-    :param fps: pictures per second, as they came of late; 0 before that can be told
-    :param at: when the last picture came, Unix time
+    :param encoding: of the last frame
+    :param width: of the last frame, pixels
+    :param height: of the last frame, pixels
+    :param fps: recent frames per second; 0 if unknown
+    :param at: arrival of the last frame, Unix time
     """
 
     camera: str
@@ -103,14 +103,14 @@ class CameraSeen(_IpcMessage, frozen=True, kw_only=True):
 
 
 class StreamEnded(_IpcMessage, frozen=True, kw_only=True):
-    """A stream is no more."""
+    """A stream has ended."""
 
     stream: str
-    why: str
+    reason: str
 
 
 class LogLine(_IpcMessage, frozen=True, kw_only=True):
-    """Something for the daemon's log.
+    """A line for the daemon's log.
 
     :param level: ``info``, ``warn``, ``error``
     """
@@ -119,14 +119,14 @@ class LogLine(_IpcMessage, frozen=True, kw_only=True):
     text: str
 
 
-Line = CameraSettings | OpenStream | CloseStream | NoFrames
-Answer = CameraAlive | StreamAccepted | CameraSeen | StreamEnded | LogLine
+DaemonMessage = CameraSettings | OpenStream | CloseStream | InhibitTopics
+CameraMessage = CameraAlive | StreamAccepted | CameraSeen | StreamEnded | LogLine
 
-decoder: msgspec.json.Decoder[Line] = msgspec.json.Decoder(Line)
-answer_decoder: msgspec.json.Decoder[Answer] = msgspec.json.Decoder(Answer)
+daemon_decoder: msgspec.json.Decoder[DaemonMessage] = msgspec.json.Decoder(DaemonMessage)
+camera_decoder: msgspec.json.Decoder[CameraMessage] = msgspec.json.Decoder(CameraMessage)
 _encoder = msgspec.json.Encoder()
 
 
-def encode(line: Line | Answer) -> bytes:
-    """A line with its end."""
-    return _encoder.encode(line) + b"\n"
+def encode(message: DaemonMessage | CameraMessage) -> bytes:
+    """A message as a line with its end."""
+    return _encoder.encode(message) + b"\n"

@@ -1,5 +1,5 @@
-"""The camera process: ``python -m robot_client.camera.main``, started by the daemon, told what to do by lines on its
-standard input. The end of that pipe is the end of the daemon, and its own.
+"""The camera process: ``python -m robot_client.camera.main``, started by the daemon, which sends messages
+on its standard input. The process exits at the end of its standard input, also if the daemon died.
 """
 
 from __future__ import annotations
@@ -21,7 +21,14 @@ from twisted.logger import (
 from twisted.protocols.basic import LineReceiver
 from twisted.python.failure import Failure
 
-from robot_client.camera.ipc import Answer, CameraAlive, CameraSettings, LogLine, decoder, encode
+from robot_client.camera.ipc import (
+    CameraAlive,
+    CameraMessage,
+    CameraSettings,
+    LogLine,
+    daemon_decoder,
+    encode,
+)
 from robot_client.camera.stream_manager import StreamManager
 from robot_client.logs import text
 from robot_client.twisted_types import monotonic_reactor
@@ -30,14 +37,14 @@ ALIVE_EVERY = 1.0
 MAX_LINE = 65536
 
 NICE = 5
-"""Steps by which this process gives way to others: commands and samples go before pictures."""
+"""Increment of the niceness, since commands and samples are more urgent than frames."""
 
-FAREWELL = 0.3
-"""Seconds for the last words on the links."""
+CLOSE_SECONDS = 0.3
+"""Seconds for the last messages on the links."""
 
 
 class DaemonPipe(LineReceiver):
-    """The daemon that started this process.
+    """The pipes to the daemon.
 
     :param reactor: its clock must be monotonic
     """
@@ -48,55 +55,58 @@ class DaemonPipe(LineReceiver):
 
     def __init__(self, reactor: Any) -> None:
         self._reactor = reactor
-        self._studio: StreamManager | None = None
-        self._alive = LoopingCall(self.tell, CameraAlive())
+        self._streams: StreamManager | None = None
+        self._alive = LoopingCall(self.send, CameraAlive())
 
     def connectionMade(self) -> None:
-        """The pipes are open."""
         self._alive.start(ALIVE_EVERY)
 
     def lineReceived(self, data: bytes) -> None:
-        """The daemon says something."""
-        line = decoder.decode(data)
-        if isinstance(line, CameraSettings):
-            self._studio = StreamManager(self._reactor, line, self.tell)
-        elif self._studio is not None:
-            self._studio.take(line)
+        message = daemon_decoder.decode(data)
+        if isinstance(message, CameraSettings):
+            self._streams = StreamManager(self._reactor, message, self.send)
+        elif self._streams is not None:
+            self._streams.handle(message)
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
-        """The daemon is gone, or wants no more pictures."""
+        """The daemon has died or closed the pipe: close all streams and exit."""
         self._alive.stop()
-        if self._studio is not None:
-            self._studio.stop("the robot shows no more pictures")
-        self._reactor.callLater(FAREWELL, self._reactor.stop)
+        if self._streams is not None:
+            self._streams.stop("the robot closed its camera process")
+        self._reactor.callLater(CLOSE_SECONDS, self._reactor.stop)
 
-    def tell(self, answer: Answer) -> None:
-        """Say something to the daemon; from the reactor's thread."""
+    def send(self, message: CameraMessage) -> None:
+        """Send a message to the daemon; from the reactor's thread."""
         if self.transport is not None:
-            self.transport.write(encode(answer))
+            self.transport.write(encode(message))
 
     def log(self, event: LogEvent) -> None:
-        """Have the daemon log something; from any thread."""
+        """Send a log event to the daemon; from any thread."""
         level = event.get("log_level")
         line = LogLine(level=level.name if level is not None else "info", text=text(event))
-        self._reactor.callFromThread(self.tell, line)
+        self._reactor.callFromThread(self.send, line)
 
 
-def _own_stdout() -> int:
-    """Take standard output for answers alone: ROS can be told to log there (RCUTILS_LOGGING_USE_STDOUT)."""
-    outlet = os.dup(1)
+def _reserve_stdout() -> int:
+    """Reserve standard output for messages: libraries write to standard error instead, as ROS can be set to
+    log to standard output (RCUTILS_LOGGING_USE_STDOUT).
+    """
+    descriptor = os.dup(1)
     os.dup2(2, 1)
-    return outlet
+    return descriptor
 
 
 def main() -> None:
-    """Show cameras until standard input ends."""
+    """Run until standard input ends."""
     os.nice(NICE)
-    # OpenCV, which reads it when it is loaded, would warn at each attempt to open a camera; Capture tells it once.
+    # Read when OpenCV is loaded. It would warn at each attempt to open a camera; Capture logs that once.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    for meant_for_the_daemon in (signal.SIGINT, signal.SIGTERM):  # it says when it is time, or its pipe ends
-        signal.signal(meant_for_the_daemon, signal.SIG_IGN)
-    outlet = _own_stdout()
+    for for_the_daemon in (
+        signal.SIGINT,
+        signal.SIGTERM,
+    ):  # this process ends when the daemon closes the pipe
+        signal.signal(for_the_daemon, signal.SIG_IGN)
+    stdout = _reserve_stdout()
     reactor = monotonic_reactor()
     daemon = DaemonPipe(reactor)
     quiet: Any = LogLevelFilterPredicate(defaultLogLevel=LogLevel.info)
@@ -105,10 +115,10 @@ def main() -> None:
     log: Any = daemon.log
     observer: Any = FilteringLogObserver(log, [quiet])
     globalLogBeginner.beginLoggingTo([observer], redirectStandardIO=False)
-    pipes: Any = stdio  # of two systems, of which mypy reads the other
-    pipes.StandardIO(daemon, stdin=0, stdout=outlet)
+    pipes: Any = stdio  # mypy reads the variant of another system
+    pipes.StandardIO(daemon, stdin=0, stdout=stdout)
     reactor.run(installSignalHandlers=False)
-    # A thread that reads a camera over a network may need half a minute to notice.
+    # Not sys.exit: a thread that reads a network camera may block for half a minute.
     os._exit(0)
 
 

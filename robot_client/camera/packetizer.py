@@ -1,8 +1,8 @@
-"""Pictures on their way to the relay: large ones in parts, with little of them unanswered.
+"""Encoded frames on their way to the relay: large ones in parts, with few unacknowledged bytes.
 
-What the kernel, a router or a tunnel has taken can't be had back, and when a link becomes thin all of it stands before
-the next picture. So no more leaves than keeps the link busy, and what is left of a picture that would come too late
-stays here.
+Bytes in the kernel, a router or a tunnel can't be recalled. When the link gets slower, they all delay the
+next frame. So no more is sent than keeps the link busy, and the rest of a frame that would arrive too late
+is discarded.
 """
 
 from __future__ import annotations
@@ -12,106 +12,110 @@ from collections.abc import Callable
 
 from relay_protocol import frames
 from relay_protocol.limits import KIB
-from relay_protocol.link import Took
+from relay_protocol.link import FrameAck
 from robot_client.camera.frame import Frame
 from robot_client.camera.rate_control import RateControl
 
 PART = 16 * KIB
-"""A larger picture goes in parts of so many bytes."""
+"""A larger frame is sent in parts of so many bytes."""
 
-QUESTION = 1
-"""Bytes of a picture that leave alone to ask for the round trip."""
+PROBE_BYTES = 1
+"""Bytes of a frame that are sent alone to measure the round trip."""
 
 
 class _OutgoingFrame:
-    def __init__(self, number: int, stamp: int, body: bytes, asks: bool, alone: bool) -> None:
+    def __init__(self, number: int, stamp: int, body: bytes, probes: bool, key: bool) -> None:
         self.number = number
-        self.alone = alone
-        self._asks = asks
-        self.left = 0
-        """Bytes that have left."""
+        self.key = key
+        self._probes = probes
+        self.sent = 0
+        """Bytes that were sent."""
         self.total = len(body)
         self._stamp = stamp
         self._body = body
 
     def next_frame(self) -> bytes:
-        if self.total <= PART and not self._asks:
-            self.left = self.total
+        if self.total <= PART and not self._probes:
+            self.sent = self.total
             return frames.encode_video(self.number, self._stamp, self._body)
-        piece = self._body[self.left : self.left + (QUESTION if self._asks and not self.left else PART)]
-        frame = frames.encode_picture_part(self.number, self._stamp, self.total, self.left, piece)
-        self.left += len(piece)
+        piece = self._body[self.sent : self.sent + (PROBE_BYTES if self._probes and not self.sent else PART)]
+        frame = frames.encode_video_part(self.number, self._stamp, self.total, self.sent, piece)
+        self.sent += len(piece)
         return frame
 
 
 class Packetizer:
-    """What has not left yet of the pictures of one stream, and what has no answer yet.
+    """The unsent and the unacknowledged frames of one stream.
 
-    :param pace: knows how much may be without answer, and what comes too late; it is told what leaves and arrives
-    :param write: takes frames
+    :param rate_control: limits the unacknowledged bytes, decides which frames are too late, and learns from
+        both
+    :param write: writes link frames
     """
 
-    def __init__(self, pace: RateControl, write: Callable[[list[bytes]], None]) -> None:
-        self._pace = pace
+    def __init__(self, rate_control: RateControl, write: Callable[[list[bytes]], None]) -> None:
+        self._rate_control = rate_control
         self._write = write
-        self._pictures: dict[int, _OutgoingFrame] = {}
-        self._answers: deque[tuple[int, int, int]] = deque()
-        """Of each frame without answer: the picture's number, how much of it has left with this one, and its bytes."""
-        self._unanswered = 0
+        self._outgoing: dict[int, _OutgoingFrame] = {}
+        self._unacknowledged: deque[tuple[int, int, int]] = deque()
+        """For each unacknowledged link frame: the frame's number, bytes of it sent so far, bytes in this
+        link frame."""
+        self._unacknowledged_bytes = 0
 
-    def put(self, number: int, shot: Frame, body: bytes, now: float, alone: bool = True) -> None:
-        """Have a picture leave, behind those that are here.
+    def put(self, number: int, frame: Frame, body: bytes, now: float, key: bool = True) -> None:
+        """Queue an encoded frame.
 
-        :param shot: what it was made of
-        :param alone: whether it needs none of those before it
+        :param frame: the camera's frame
+        :param key: whether it is decodable without the frames before it
         """
-        self._pace.sent(number, len(body), now, shot.arrived)
-        self._pictures[number] = _OutgoingFrame(number, shot.stamp, body, self._pace.asks(number), alone)
-        self._go()
+        self._rate_control.sent(number, len(body), now, frame.arrived)
+        self._outgoing[number] = _OutgoingFrame(
+            number, frame.stamp, body, self._rate_control.probes(number), key
+        )
+        self._send()
 
-    def answered(self, took: Took, now: float, round_trip: float | None) -> bool:
-        """The relay has a picture or part of it, and so all that left before; an answer to nothing is passed over.
+    def on_ack(self, ack: FrameAck, now: float, round_trip: float | None) -> bool:
+        """The relay has a frame or a part of it, and all that was sent before; unknown numbers are ignored.
 
-        :param round_trip: latest of the link, seconds, where known
-        :return: whether pictures were given up that had begun to leave, or should have
+        :param round_trip: latest of the link, seconds; ``None`` if unknown
+        :return: whether unsent or partly sent frames were discarded
         """
-        met = [
+        confirmed = [
             at
-            for at, (number, left, _) in enumerate(self._answers)
-            if number == took.number and (took.upto is None or left <= took.upto)
+            for at, (number, sent, _) in enumerate(self._unacknowledged)
+            if number == ack.number and (ack.received is None or sent <= ack.received)
         ]
-        for _ in range(met[-1] + 1 if met else 0):
-            self._unanswered -= self._answers.popleft()[2]
-        if took.upto is None:
-            self._pace.took(took.number, now, round_trip)
+        for _ in range(confirmed[-1] + 1 if confirmed else 0):
+            self._unacknowledged_bytes -= self._unacknowledged.popleft()[2]
+        if ack.received is None:
+            self._rate_control.frame_acknowledged(ack.number, now, round_trip)
         else:
-            self._pace.came(took.number, took.upto, now, round_trip)
-        lost = self._lost(self._pace.hopeless(now))
-        for number in lost:
-            self._pace.gave_up(number, self._pictures.pop(number).left, now)
-        self._go()
-        return bool(lost)
+            self._rate_control.part_acknowledged(ack.number, ack.received, now, round_trip)
+        discarded = self._to_discard(self._rate_control.too_late(now))
+        for number in discarded:
+            self._rate_control.discard(number, self._outgoing.pop(number).sent, now)
+        self._send()
+        return bool(discarded)
 
-    def _lost(self, hopeless: set[int]) -> list[int]:
-        """Numbers of the pictures here that are hopeless, or no use without one that is."""
-        lost: list[int] = []
+    def _to_discard(self, too_late: set[int]) -> list[int]:
+        """Numbers of unsent frames that are too late, or need one that is."""
+        found: list[int] = []
         broken = False
-        for number, picture in self._pictures.items():
-            broken = number in hopeless or (broken and not picture.alone)
+        for number, outgoing in self._outgoing.items():
+            broken = number in too_late or (broken and not outgoing.key)
             if broken:
-                lost.append(number)
-        return lost
+                found.append(number)
+        return found
 
-    def _go(self) -> None:
+    def _send(self) -> None:
         out = []
-        while self._pictures and self._unanswered < self._pace.window:
-            picture = next(iter(self._pictures.values()))
-            before = picture.left
-            out.append(picture.next_frame())
-            size = picture.left - before
-            self._answers.append((picture.number, picture.left, size))
-            self._unanswered += size
-            if picture.left == picture.total:
-                del self._pictures[picture.number]
+        while self._outgoing and self._unacknowledged_bytes < self._rate_control.window:
+            outgoing = next(iter(self._outgoing.values()))
+            before = outgoing.sent
+            out.append(outgoing.next_frame())
+            size = outgoing.sent - before
+            self._unacknowledged.append((outgoing.number, outgoing.sent, size))
+            self._unacknowledged_bytes += size
+            if outgoing.sent == outgoing.total:
+                del self._outgoing[outgoing.number]
         if out:
             self._write(out)

@@ -1,11 +1,18 @@
-"""How much of a picture the uplink bears: measured by what the relay took, decided step by step.
+"""Rate control: quality, size and rate of frames that the uplink carries within the target delay.
 
-The link is taken for a pipe of one rate: a picture that leaves at once is there after the round trip and the time
-its bytes take. From each ``took`` follows that rate, from the rate how many bytes a picture may have, and from the size
-of the latest picture at its step the step at which the next one is as small as that.
+Model: the link is a pipe of one rate. A frame arrives after the round trip and the time that its bytes
+take. Each acknowledgement gives that rate, and the rate gives the most bytes of a frame. The size of the
+latest frame at its step gives the step at which the next one is small enough.
 
-A link that becomes thin while a large picture is on its way is noticed by the answers to its parts: two in a row by
-which the picture would come far too late, and it is given up.
+If the link gets slower while a large frame is on its way, the acknowledgements of its parts show it: when
+two in a row predict that the frame arrives far too late, it is discarded.
+
+The round trip (:class:`RttProbe`) is that of an idle link. On a slow link a ping measures how long frames
+queue, so a measurement may always lower the estimate, but only a probe raises it: no frame is sent until
+all are acknowledged, then a few bytes are sent alone. BBR finds its minimal round trip in the same way
+(draft-cardwell-iccrg-bbr-congestion-control, ProbeRTT). A probe starts only when all measurements have been
+longer for a while. It does not start while a frame is sent that is never discarded: that frame would hold
+up all streams, and is the reason for the longer measurements.
 """
 
 from __future__ import annotations
@@ -15,67 +22,68 @@ from typing import NamedTuple
 
 from relay_protocol.limits import KIB
 from relay_protocol.link import VideoSettings
-from robot_client.camera.rtt_probe import RttProbe, longer
 
 TARGET = 0.3
-"""Unless another one is wanted: seconds from a picture's arrival at the robot to the relay's word that it is there."""
+"""Default target: seconds from a frame's arrival at the robot to its acknowledgement by the relay."""
 
-UNDER_WAY = 2
-"""Most pictures the relay has not taken yet (SPEC 2.6)."""
+MAX_UNACKNOWLEDGED = 2
+"""Most unacknowledged frames (SPEC 2.6)."""
 
-SHARE = 0.4
-"""Of the time that is left, what one picture's bytes may take: the one before it may still be on its way."""
+FRAME_SHARE = 0.4
+"""Share of the remaining time that the bytes of one frame may take: the frame before may still be on its
+way."""
 
-ROOM = 0.7
-"""How full the next better step may be as far as one can tell, for it to be tried."""
+STEP_UP_LOAD = 0.7
+"""Highest predicted load at which the next better step is tried."""
 
-HOLD = (0.5, 16.0)
-"""Seconds between two steps upwards; doubled up to the second when a step had to be taken back."""
+STEP_UP_DELAY = (0.5, 16.0)
+"""Seconds between two steps up; doubled up to the second value when a step up had to be reverted."""
 
-PROVED = 4.0
-"""Seconds after which a step upwards counts as good."""
+STABLE = 4.0
+"""Seconds after which a step up counts as successful."""
 
 SLACK = 0.05
-"""Seconds by which a picture may be later than expected before another one is put behind it."""
+"""Seconds by which a frame may be later than expected before the next one waits for it."""
 
-QUICKEST = 0.001
-"""Seconds; what is shorter says nothing of the link."""
+MIN_MEASURED = 0.001
+"""Seconds; shorter times say nothing about the link."""
 
-_TELLING = 4096
-"""Bytes; a smaller picture that is late says more of the processor than of the link, unless others are late too."""
+_MEANINGFUL_BYTES = 4096
+"""A late frame of fewer bytes says more about the processor than about the link, unless others are late
+too."""
 
-HOPELESS = 3
-"""Times the target; a picture that would be later is given up, if a smaller one can be made."""
+DISCARD_DELAY = 3
+"""Multiple of the target; a frame that would be later is discarded if a smaller one is possible."""
 
 WINDOW = 48 * KIB
-"""Bytes without answer that may always be on their way. When a link becomes thin they must pass before the next picture
-does: at 200 kbit/s in 2 s."""
+"""Unacknowledged bytes that are always allowed. When the link gets slower they delay the next frame: at 200
+kbit/s by 2 s."""
 
-PIPES = 1.5
-"""Times what fits into the link in a round trip may be on its way, so that it is never empty and more can be tried."""
+WINDOW_GAIN = 1.5
+"""Multiple of the bandwidth-delay product that may be unacknowledged, so that the link is never idle."""
 
-AGAIN = 0.05
-"""Seconds after which a stream with nothing under way asks again whether the others still hold the link."""
+PROBE_POLL = 0.05
+"""Seconds after which an idle stream checks again whether a probe is still running."""
 
-DAWDLE = 0.04
-"""Seconds; a link is not filled more than it takes to have a picture leave in that time."""
+FRAME_SEND_TIME = 0.04
+"""Seconds in which a frame should be sent; the window need not be larger."""
 
-_UNMISTAKABLE = 2
-"""Times the target; what is later than that needs no second one to be believed."""
+_CERTAINLY_LATE = 2
+"""Multiple of the target; a frame later than that needs no second one as confirmation."""
 
-_LEAST_QUALITY = 35
-_QUALITIES = (65, 50, _LEAST_QUALITY)
+_MIN_QUALITY = 35
+_QUALITIES = (65, 50, _MIN_QUALITY)
 _SCALES = (0.75, 0.56, 0.42, 0.32, 0.24, 0.18)
 _RATES = (3.0, 2.0, 1.0)
-_BUSY = 0.5
-"""Of the time between two pictures at a lowered rate, what a picture may take."""
+_LOW_RATE_SHARE = 0.5
+"""Share of the frame period, at a lowered rate, that a frame may take."""
 
 
 class RateStep(NamedTuple):
-    """One way to make pictures.
+    """Settings for frames.
 
-    :param fps: most pictures per second; 0 for all
-    :param weight: bytes of a picture, as a part of those at the first step, by experience with JPEG
+    :param fps: most frames per second; 0 for no limit
+    :param weight: bytes of a frame relative to the first step, measured with JPEG
     """
 
     quality: int
@@ -90,17 +98,17 @@ class _SentFrame:
     step: int
     arrived: float
     at: float
-    there: int = 0
-    """Bytes the relay has."""
-    given_up: bool = False
-    asks: bool = False
-    """Whether only a few bytes have left, which ask for the round trip."""
-    held: float = 0.0
-    """Seconds it waited for their answer."""
+    acknowledged: int = 0
+    """Bytes that the relay has."""
+    discarded: bool = False
+    probing: bool = False
+    """Whether only the few bytes of a probe were sent."""
+    probe_time: float = 0.0
+    """Seconds it waited for the answer to the probe."""
 
 
 def steps(settings: VideoSettings) -> list[RateStep]:
-    """From what was asked for down to the least there is: first quality goes, then size, then rate."""
+    """Steps from the requested settings down: first quality, then size, then rate is reduced."""
     found = [RateStep(settings.quality, 1.0, settings.fps, 1.0)]
     if settings.codec != "png":
         for quality in (each for each in _QUALITIES if each < settings.quality):
@@ -114,104 +122,114 @@ def steps(settings: VideoSettings) -> list[RateStep]:
 
 
 def _bytes_at(quality: int) -> float:
-    """Bytes of a JPEG by its quality, those at 80 being 1 (pictures of rooms and streets)."""
+    """Bytes of a JPEG by its quality, relative to quality 80 (measured with images of rooms and streets)."""
     return 0.25 + 0.25 * quality / 50 + (0.35 * ((quality - 50) / 30) if quality > 50 else 0.0)
 
 
 class RateControl:
-    """Decides for one stream when a picture is made, and how. Pure: times are given, in seconds of one clock.
+    """Decides when a stream encodes its next frame, and with which settings. All times are seconds of one
+    clock.
 
-    :param way: what is known of the way to the relay, with all other streams that take it
-    :param target: delay to stay under; with a round trip of more than half of it, twice the round trip
+    :param rtt_probe: shared by all streams to the same relay
+    :param target: longest delay, seconds; if the round trip exceeds half of it, twice the round trip is used
     """
 
-    def __init__(self, settings: VideoSettings, way: RttProbe | None = None, target: float = TARGET) -> None:
+    def __init__(
+        self, settings: VideoSettings, rtt_probe: RttProbe | None = None, target: float = TARGET
+    ) -> None:
         self.delay: float | None = None
-        """Seconds from arrival to ``took``, smoothed; ``None`` before the first."""
+        """Smoothed seconds from arrival to acknowledgement; ``None`` before the first."""
         self.rate: float | None = None
-        """Bytes per second the uplink carries, as measured."""
+        """Measured bytes per second of the uplink."""
         self._target = target
-        # Nobody looks at a stream of PNG: who asks for one picture waits for it.
-        self._gives_up = settings.codec != "png"
+        # PNG is used for single images, and their client waits for them.
+        self._discards = settings.codec != "png"
         self._steps = steps(settings)
         self._step = 0
-        self._under_way: dict[int, _SentFrame] = {}
+        self._unacknowledged: dict[int, _SentFrame] = {}
         self._free_at = 0.0
-        self._way = way or RttProbe()
-        self._reckoned = self._trip
-        """The round trip by which the rate was measured."""
-        self._own = 0.0
+        self._rtt_probe = rtt_probe or RttProbe()
+        self._rate_round_trip = self._round_trip
+        """Round trip with which the rate was measured."""
+        self._processing = 0.0
+        """Smoothed seconds from arrival to sending."""
         self._unit: float | None = None
+        """Smoothed bytes of a frame at the first step."""
         self._due = float("-inf")
-        self._last_took = self._last_answer = float("-inf")
+        self._last_frame_ack = self._last_ack = float("-inf")
         self._progress = self._latest = 0.0
         self._flowed = 0
-        """Bytes answered since the link was last empty: what shows that it is as quick as it was."""
-        self._doubts = 0
+        """Bytes acknowledged since the link was last idle; they show that it is as fast as before."""
+        self._late_acks = 0
         self._late = False
-        self._hold = HOLD[0]
+        self._step_up_delay = STEP_UP_DELAY[0]
         self._raised = self._changed = float("-inf")
 
     @property
     def quality(self) -> int:
-        """Of JPEG."""
+        """JPEG quality."""
         return self._steps[self._step].quality
 
     @property
     def scale(self) -> float:
-        """Of width and height."""
+        """Factor for width and height."""
         return self._steps[self._step].scale
 
     @property
     def fps(self) -> float:
-        """Most pictures per second; 0 for all."""
+        """Most frames per second; 0 for no limit."""
         return self._steps[self._step].fps
 
     @property
     def reduced(self) -> float:
-        """How far below what was asked for: 0 as asked, 1 the least there is."""
+        """Reduction below the requested settings: 0 none, 1 the most."""
         return self._step / (len(self._steps) - 1)
 
     @property
     def window(self) -> float:
-        """Bytes without answer from which on no more should leave; while in doubt they leave one part at a time."""
-        if self._doubts or any(each.asks for each in self._under_way.values()):
+        """Unacknowledged bytes at which sending pauses; after a late acknowledgement one part is sent at a
+        time."""
+        if self._late_acks or any(each.probing for each in self._unacknowledged.values()):
             return 1
-        full = PIPES * self._trip * min(self._progress, self._bytes(self._step) / DAWDLE)
+        full = WINDOW_GAIN * self._round_trip * min(self._progress, self._bytes(self._step) / FRAME_SEND_TIME)
         return max(WINDOW, min(full, WINDOW + self._flowed))
 
     def may_send(self, now: float) -> bool:
-        """Whether a picture made now would be there in time, as far as one can tell."""
-        if len(self._under_way) >= UNDER_WAY or self.wait(now) > 0 or not self._way.may_leave(now):
+        """Whether a frame that is encoded now is predicted to arrive in time."""
+        if (
+            len(self._unacknowledged) >= MAX_UNACKNOWLEDGED
+            or self.wait(now) > 0
+            or not self._rtt_probe.may_send(now)
+        ):
             return False
-        if not self._under_way:
+        if not self._unacknowledged:
             return True
         if self.rate is None or self._unit is None:
-            return False  # the first picture alone shows what the link is like
-        last = max(each.at for each in self._under_way.values())
-        if now > max(self._free_at, last) + self._trip + SLACK:
-            return False  # it is slower than it was
+            return False  # the first frame must measure the link first
+        last = max(each.at for each in self._unacknowledged.values())
+        if now > max(self._free_at, last) + self._round_trip + SLACK:
+            return False  # the link has become slower
         ahead = max(0.0, self._free_at - now)
-        return self._own + ahead + self._bytes(self._step) / self.rate + self._trip <= self._goal
+        return self._processing + ahead + self._bytes(self._step) / self.rate + self._round_trip <= self._goal
 
     def wait(self, now: float) -> float:
-        """Seconds until another picture may be made, where no answer tells that."""
-        held = not self._under_way and not self._way.may_leave(now)
-        return max(self._due - now if self.fps else 0.0, AGAIN if held else 0.0)
+        """Seconds until another frame may be encoded, if that does not depend on an acknowledgement."""
+        probing = not self._unacknowledged and not self._rtt_probe.may_send(now)
+        return max(self._due - now if self.fps else 0.0, PROBE_POLL if probing else 0.0)
 
     def sent(self, number: int, size: int, now: float, arrived: float) -> None:
-        """A picture begins to leave.
+        """A frame starts being sent.
 
         :param size: bytes
-        :param arrived: when the camera's picture reached us
+        :param arrived: when the camera's frame arrived
         """
-        if not self._under_way:
+        if not self._unacknowledged:
             self._flowed = 0
-        asks = self._way.leaves(self, now, patient=not self._gives_up)
-        self._under_way[number] = _SentFrame(size, self._step, arrived, now, asks=asks)
-        self._own = _smooth(self._own, now - arrived, 0.2)
+        probing = self._rtt_probe.begin(self, now, undiscardable=not self._discards)
+        self._unacknowledged[number] = _SentFrame(size, self._step, arrived, now, probing=probing)
+        self._processing = _smooth(self._processing, now - arrived, 0.2)
         if self.fps:
-            # One that is late does not put off those that follow, by up to half of their distance.
+            # A late frame does not delay those that follow, by up to half of the period.
             self._due = max(self._due, now - 0.5 / self.fps) + 1 / self.fps
         unit = size / self._steps[self._step].weight
         self._unit = unit if self._unit is None else _smooth(self._unit, unit, 0.5)
@@ -219,127 +237,134 @@ class RateControl:
             self._free_at = max(now, self._free_at) + size / self.rate
             self._fit(now)
 
-    def asks(self, number: int) -> bool:
-        """Whether of this picture a few bytes leave first, and the rest when they have an answer."""
-        return self._under_way[number].asks
+    def probes(self, number: int) -> bool:
+        """Whether a few bytes of this frame are sent first as a probe, and the rest after their
+        acknowledgement."""
+        return self._unacknowledged[number].probing
 
     def close(self, now: float) -> None:
-        """No more pictures leave, and no more answers come."""
-        self._under_way.clear()
-        self._way.idle(self, now)
+        """The stream has ended."""
+        self._unacknowledged.clear()
+        self._rtt_probe.idle(self, now)
 
-    def took(self, number: int, now: float, round_trip: float | None = None) -> None:
-        """The relay has a picture; a number that is not under way is passed over.
+    def frame_acknowledged(self, number: int, now: float, round_trip: float | None = None) -> None:
+        """The relay has a frame; unknown numbers are ignored.
 
-        :param round_trip: latest of the link, where known
+        :param round_trip: latest of the link, seconds; ``None`` if unknown
         """
-        sent = self._under_way.pop(number, None)
+        sent = self._unacknowledged.pop(number, None)
         if sent is None:
             return
         seconds = self._learn(sent, sent.size, now, round_trip)
         delay = now - sent.arrived
         self.delay = delay if self.delay is None else _smooth(self.delay, delay, 0.3)
-        self._measure(sent.size, seconds, delay - sent.held)
-        self._passed(now)
+        self._measure(sent.size, seconds, delay - sent.probe_time)
+        self._frame_complete(now)
         self._fit(now)
 
-    def came(self, number: int, upto: int, now: float, round_trip: float | None = None) -> None:
-        """The relay has a part of a picture; what is not under way is passed over.
+    def part_acknowledged(self, number: int, upto: int, now: float, round_trip: float | None = None) -> None:
+        """The relay has a part of a frame; unknown numbers are ignored.
 
-        :param upto: bytes of the picture that are there
-        :param round_trip: as with :meth:`took`
+        :param upto: bytes of the frame that the relay has
+        :param round_trip: as for :meth:`frame_acknowledged`
         """
-        sent = self._under_way.get(number)
-        if sent is None or not sent.there < upto < sent.size + sent.given_up:
+        sent = self._unacknowledged.get(number)
+        if sent is None or not sent.acknowledged < upto < sent.size + sent.discarded:
             return
-        if sent.asks:
-            self._replied(sent, upto, now)
+        if sent.probing:
+            self._probe_answered(sent, upto, now)
             return
         self._learn(sent, upto, now, round_trip)
-        if sent.given_up and upto == sent.size:
-            del self._under_way[number]
-            self._passed(now)
+        if sent.discarded and upto == sent.size:
+            del self._unacknowledged[number]
+            self._frame_complete(now)
 
-    def hopeless(self, now: float) -> set[int]:
-        """Numbers of the pictures that would come far too late, by two answers in a row."""
-        if self._doubts < 2:
+    def too_late(self, now: float) -> set[int]:
+        """Numbers of frames that two acknowledgements in a row predict to arrive far too late."""
+        if self._late_acks < 2:
             return set()
         return self._late_ones(now)
 
-    def gave_up(self, number: int, left: int, now: float) -> None:
-        """No more of a picture leaves; one that is not under way is passed over.
+    def discard(self, number: int, sent_bytes: int, now: float) -> None:
+        """The rest of a frame is not sent; unknown numbers are ignored.
 
-        :param left: bytes of it that have left
+        :param sent_bytes: bytes of it that were sent
         """
-        sent = self._under_way.get(number)
-        if sent is None:  # the relay has said that it has it, whatever of it has left
+        sent = self._unacknowledged.get(number)
+        if sent is None:  # already acknowledged as a whole
             return
-        sent.size, sent.given_up = left, True
-        if sent.there == left:
-            del self._under_way[number]
-            self._rest(now)
+        sent.size, sent.discarded = sent_bytes, True
+        if sent.acknowledged == sent_bytes:
+            del self._unacknowledged[number]
+            self._report_idle(now)
         self.rate = self._latest if self.rate is None else min(self.rate, self._latest)
-        coming = sum(each.size - each.there for each in self._under_way.values())
-        self._free_at = max(now, now - self._trip + coming / self.rate)
-        self._doubts = 0
+        unacknowledged = sum(each.size - each.acknowledged for each in self._unacknowledged.values())
+        self._free_at = max(now, now - self._round_trip + unacknowledged / self.rate)
+        self._late_acks = 0
         self._fit(now)
 
-    def _replied(self, sent: _SentFrame, upto: int, now: float) -> None:
-        """The answer to what asked for the round trip; all else of the picture leaves now."""
-        self._way.answered(self, now)
-        sent.asks, sent.there = False, upto
-        sent.held, sent.at = now - sent.at, now
-        self._last_answer = now
-        self._free_at += sent.held
+    def _probe_answered(self, sent: _SentFrame, upto: int, now: float) -> None:
+        """The probe was acknowledged; the rest of the frame is sent now."""
+        self._rtt_probe.answered(self, now)
+        sent.probing, sent.acknowledged = False, upto
+        sent.probe_time, sent.at = now - sent.at, now
+        self._last_ack = now
+        self._free_at += sent.probe_time
 
     def _learn(self, sent: _SentFrame, upto: int, now: float, round_trip: float | None) -> float:
-        """Take an answer: how quick this picture has been so far, and whether those under way will come in time.
+        """Update the estimates by an acknowledgement.
 
-        :return: seconds its bytes took, at most
+        :return: upper bound of the seconds that the bytes took
         """
         if round_trip is not None:
-            self._way.measured(round_trip, now)
-        if longer(self._trip, self._reckoned):
-            # The rate was measured by a wrong one, and so much was tried in vain.
-            self.rate, self._hold = None, HOLD[0]
-        self._reckoned = self._trip
-        # Behind another picture it began to go only when that one was there.
-        began = max(sent.at, self._last_took - self._trip)
-        seconds = max(now - began - self._trip, (now - began) / 8, QUICKEST)
+            self._rtt_probe.add_measurement(round_trip, now)
+        if is_longer(self._round_trip, self._rate_round_trip):
+            # The rate was measured with a wrong round trip, and steps up failed for that reason.
+            self.rate, self._step_up_delay = None, STEP_UP_DELAY[0]
+        self._rate_round_trip = self._round_trip
+        # After another frame, its transmission began only when that one had arrived.
+        began = max(sent.at, self._last_frame_ack - self._round_trip)
+        seconds = max(now - began - self._round_trip, (now - began) / 8, MIN_MEASURED)
         self._progress = upto / seconds
-        self._latest = (upto - sent.there) / max(now - self._last_answer, QUICKEST)
-        self._flowed += upto - sent.there
-        sent.there, self._last_answer = upto, now
-        self._doubts = self._doubts + 1 if self._late_ones(now) else 0
+        self._latest = (upto - sent.acknowledged) / max(now - self._last_ack, MIN_MEASURED)
+        self._flowed += upto - sent.acknowledged
+        sent.acknowledged, self._last_ack = upto, now
+        self._late_acks = self._late_acks + 1 if self._late_ones(now) else 0
         return seconds
 
     def _late_ones(self, now: float) -> set[int]:
-        """Pictures too late even by the better of two rates: answers a busy processor held up come at once then."""
+        """Frames that are too late even by the better of two rates: a busy processor delays
+        acknowledgements, which then arrive together.
+        """
         rate, ahead, late = max(self._progress, self._latest), 0, set()
-        for number, each in self._under_way.items():
-            ahead += each.size - each.there
-            smaller = self._gives_up and each.step < len(self._steps) - 1
-            if smaller and not each.given_up and now - each.arrived + ahead / rate > HOPELESS * self._goal:
+        for number, each in self._unacknowledged.items():
+            ahead += each.size - each.acknowledged
+            discardable = self._discards and each.step < len(self._steps) - 1
+            if (
+                discardable
+                and not each.discarded
+                and now - each.arrived + ahead / rate > DISCARD_DELAY * self._goal
+            ):
                 late.add(number)
         return late
 
-    def _passed(self, now: float) -> None:
-        """All of a picture that left is there."""
-        self._last_took = now
-        if not self._under_way:
+    def _frame_complete(self, now: float) -> None:
+        """All sent bytes of a frame have arrived."""
+        self._last_frame_ack = now
+        if not self._unacknowledged:
             self._free_at = now
-        self._rest(now)
+        self._report_idle(now)
 
-    def _rest(self, now: float) -> None:
-        """Let others know when nothing is under way."""
-        if not self._under_way:
-            self._way.idle(self, now)
+    def _report_idle(self, now: float) -> None:
+        """Notify the probe if this stream has nothing unacknowledged."""
+        if not self._unacknowledged:
+            self._rtt_probe.idle(self, now)
 
     def _measure(self, size: int, seconds: float, delay: float) -> None:
-        """Take one measurement: so many bytes took so long, at most; a busy processor makes it longer."""
+        """Update the rate by bytes and an upper bound of their time; a busy processor makes it longer."""
         rate = size / seconds
         late = delay / self._goal
-        sure = size >= _TELLING and late > (1 if self._late else _UNMISTAKABLE)
+        sure = size >= _MEANINGFUL_BYTES and late > (1 if self._late else _CERTAINLY_LATE)
         self._late = late > 1
         if self.rate is None or (rate < self.rate and sure):
             self.rate = rate
@@ -349,18 +374,22 @@ class RateControl:
             self.rate = _smooth(self.rate, rate, 0.25)
 
     def _fit(self, now: float) -> None:
-        """Go down to where a picture is small enough at once, up by one step at a time."""
+        """Step down at once as far as needed, step up by one at a time."""
         if self._too_large(self._step, 1.0):
             best = self._step
             while best < len(self._steps) - 1 and self._too_large(best, 0.9):
                 best += 1
-            if now - self._raised < PROVED:
-                self._hold = min(self._hold * 2, HOLD[1])
+            if now - self._raised < STABLE:
+                self._step_up_delay = min(self._step_up_delay * 2, STEP_UP_DELAY[1])
                 self._raised = float("-inf")
             self._change(best, now)
-        elif self._step and now - self._changed >= self._hold and not self._too_large(self._step - 1, ROOM):
-            if now - self._raised >= PROVED and self._raised > float("-inf"):
-                self._hold = max(HOLD[0], self._hold / 2)
+        elif (
+            self._step
+            and now - self._changed >= self._step_up_delay
+            and not self._too_large(self._step - 1, STEP_UP_LOAD)
+        ):
+            if now - self._raised >= STABLE and self._raised > float("-inf"):
+                self._step_up_delay = max(STEP_UP_DELAY[0], self._step_up_delay / 2)
             self._change(self._step - 1, now)
             self._raised = now
 
@@ -369,26 +398,129 @@ class RateControl:
             self._step = step
             self._changed = now
 
-    def _too_large(self, step: int, full: float) -> bool:
-        """Whether a picture of this step would take more than a part of the time it may take."""
+    def _too_large(self, step: int, load: float) -> bool:
+        """Whether a frame at this step would take more than this share of its time."""
         if self.rate is None:
             return False
-        time = max(self._goal - self._trip - self._own, self._goal / 3) * SHARE
+        time = max(self._goal - self._round_trip - self._processing, self._goal / 3) * FRAME_SHARE
         fps = self._steps[step].fps
         if fps in _RATES:
-            time = max(time, _BUSY / fps)
-        return self._bytes(step) / self.rate > time * full
+            time = max(time, _LOW_RATE_SHARE / fps)
+        return self._bytes(step) / self.rate > time * load
 
     def _bytes(self, step: int) -> float:
         return (self._unit or 0.0) * self._steps[step].weight
 
     @property
-    def _trip(self) -> float:
-        return self._way.seconds
+    def _round_trip(self) -> float:
+        return self._rtt_probe.seconds
 
     @property
     def _goal(self) -> float:
-        return max(self._target, 2 * self._trip)
+        return max(self._target, 2 * self._round_trip)
+
+
+MARGIN = (0.02, 0.25)
+"""Seconds, and relative to the round trip: the larger is the variation of measurements on an unchanged
+link."""
+
+PROBE_AFTER = 3.0
+"""Seconds of longer measurements only, after which a probe starts: three pings."""
+
+PROBE_INTERVAL = 10.0
+"""Least seconds between two probes; each costs a frame or two."""
+
+DRAIN_TIMEOUT = 1.0
+"""Seconds to wait for acknowledgements before a probe; then it is given up."""
+
+PROBE_TIMEOUT = 3.0
+"""Longest seconds for the answer to a probe."""
+
+
+class RttProbe:
+    """Round trip of the idle path to one relay, shared by all streams to it. All times are seconds of one
+    clock."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        """The round trip, 0 before it is known."""
+        self._known = False
+        self._longer_since: float | None = None
+        self._sending: set[object] = set()
+        """Streams with unacknowledged frames."""
+        self._undiscardable: set[object] = set()
+        """Those of them whose frame is never discarded."""
+        self._requested_at: float | None = None
+        """Since when frames are held back for a probe, or when it was sent."""
+        self._probing_stream: object | None = None
+        """The stream whose few bytes are on their way alone."""
+        self._sent_at = self._ended_at = float("-inf")
+
+    def add_measurement(self, seconds: float, now: float) -> None:
+        """A ping was answered; it may have queued behind frames."""
+        if not self._known or seconds < self.seconds:
+            self.seconds, self._known = seconds, True
+        if not is_longer(seconds, self.seconds):
+            self._longer_since = None
+        elif self._longer_since is None:
+            self._longer_since = now
+
+    def may_send(self, now: float) -> bool:
+        """Whether a frame may be sent now, as far as probes are concerned."""
+        if self._undiscardable and self._probing_stream is None:
+            if self._requested_at is not None:
+                self._end(now)
+            return True
+        if self._requested_at is None:
+            longer_since, ended_at = self._longer_since, self._ended_at
+            if longer_since is None or now - longer_since < PROBE_AFTER or now - ended_at < PROBE_INTERVAL:
+                return True
+            self._requested_at = now
+        elif now - self._requested_at > (DRAIN_TIMEOUT if self._probing_stream is None else PROBE_TIMEOUT):
+            self._end(now)
+            return True
+        return self._is_idle()
+
+    def begin(self, stream: object, now: float, undiscardable: bool = False) -> bool:
+        """A stream starts sending a frame.
+
+        :param undiscardable: whether the frame is never discarded, however long it takes
+        :return: whether it is a probe: only a few bytes may be sent before their acknowledgement
+        """
+        probes = self._requested_at is not None and self._is_idle()
+        self._sending.add(stream)
+        if undiscardable:
+            self._undiscardable.add(stream)
+        if probes:
+            self._probing_stream, self._requested_at, self._sent_at = stream, now, now
+        return probes
+
+    def answered(self, stream: object, now: float) -> None:
+        """The few bytes of a stream were acknowledged."""
+        if self._probing_stream is stream:
+            self.seconds, self._known = now - self._sent_at, True
+            self._longer_since = None
+            self._end(now)
+
+    def idle(self, stream: object, now: float) -> None:
+        """A stream has no unacknowledged frames."""
+        self._sending.discard(stream)
+        self._undiscardable.discard(stream)
+        if self._probing_stream is stream:
+            self._end(now)
+
+    def _is_idle(self) -> bool:
+        return self._probing_stream is None and not self._sending
+
+    def _end(self, now: float) -> None:
+        self._requested_at = self._probing_stream = None
+        self._ended_at = now
+
+
+def is_longer(seconds: float, than: float) -> bool:
+    """Whether a round trip is longer than another one by more than the usual variation."""
+    absolute, relative = MARGIN
+    return seconds > than + max(absolute, relative * than)
 
 
 def _smooth(old: float, new: float, share: float) -> float:

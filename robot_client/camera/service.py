@@ -1,4 +1,5 @@
-"""The daemon's side of cameras: which there are, told to the relay; streams, opened and closed as it wants them."""
+"""The daemon's cameras: the list that the relay receives, and streams, opened and closed as the relay
+requests."""
 
 from __future__ import annotations
 
@@ -12,53 +13,56 @@ from robot_client.twisted_types import DelayedCall, ReactorClock
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-TELL_EVERY = 1.0
-"""Seconds between two words of ``cameras``, at least."""
+REPORT_INTERVAL = 1.0
+"""Least seconds between two ``cameras`` messages."""
 
 
 class DaemonCameras:
-    """Knows the cameras of one robot.
+    """The cameras of one robot.
 
-    :param configured: cameras without ROS: what to open, by name
-    :param keeper: of the process that shows them
-    :param say: to the relay
+    :param configured: sources of cameras without ROS, by name
+    :param supervisor: of the camera process
+    :param send: sends a message to the relay
+    :param address: returns that of the control link
     """
 
     def __init__(
         self,
         configured: Mapping[str, str],
-        keeper: CameraSupervisor,
-        say: Callable[[link.Message], None],
+        supervisor: CameraSupervisor,
+        send: Callable[[link.Message], None],
         clock: ReactorClock,
+        address: Callable[[], str],
     ) -> None:
+        self._address = address
         self._configured = configured
-        self._keeper = keeper
-        self._say = say
+        self._supervisor = supervisor
+        self._send = send
         self._clock = clock
         self._topics: dict[str, str] = {}
         self._seen: dict[str, CameraSeen] = {}
         self._heartbeat = limits.HEARTBEAT_SECONDS
-        self._told: list[link.Camera] | None = None
-        self._told_at = float("-inf")
+        self._reported: list[link.Camera] | None = None
+        self._reported_at = float("-inf")
         self._timer: DelayedCall | None = None
-        keeper.on_seen = self._on_seen
+        supervisor.on_seen = self._on_seen
 
     def registered(self, heartbeat: float) -> None:
-        """The relay knows us now; tell it all.
+        """Report all cameras to the relay.
 
-        :param heartbeat: seconds, for the links to come
+        :param heartbeat: seconds, for the links of streams
         """
         self._heartbeat = heartbeat
-        self._told = None
-        self._tell()
+        self._reported = None
+        self._report()
 
-    def unregistered(self, why: str) -> None:
-        """The control link is gone, and all streams with it."""
-        self._told = None
-        self._keeper.close_all(why)
+    def link_lost(self, reason: str) -> None:
+        """Close all streams, since the control link is lost."""
+        self._reported = None
+        self._supervisor.close_all(reason)
 
-    def look(self, view: GraphView) -> None:
-        """Take note of the graph."""
+    def update_graph(self, view: GraphView) -> None:
+        """Find the cameras in the graph."""
         topics = {
             name: type
             for name, topic in view.topics.items()
@@ -74,10 +78,10 @@ class DaemonCameras:
             self._changed()
 
     def open(self, message: link.OpenVideo) -> None:
-        """The relay wants to see a camera; the process says so on the stream's link when there is none."""
+        """Open a stream. If there is no such camera, the process reports that on the stream's link."""
         source = self._configured.get(message.camera, "")
         topic, type = self._topic_of(message.camera, message.settings.transport) if not source else ("", "")
-        self._keeper.open(
+        self._supervisor.open(
             OpenStream(
                 stream=message.stream,
                 ticket=message.ticket,
@@ -86,21 +90,22 @@ class DaemonCameras:
                 topic=topic,
                 compressed=type == COMPRESSED,
                 source=source,
-                address=message.address,
+                address=message.address or self._address(),
                 heartbeat=self._heartbeat,
             )
         )
 
     def close(self, message: link.CloseVideo) -> None:
-        """Nobody watches any more."""
-        self._keeper.close(message.stream, "nobody watches any more")
+        """Close a stream."""
+        self._supervisor.close(message.stream, "the relay closed it")
 
-    def silence(self, topics: Iterable[str]) -> None:
-        """Let these topics show nothing new, and all others go on."""
-        self._keeper.silence(topics)
+    def inhibit(self, topics: Iterable[str]) -> None:
+        """Set the inhibited topics; their cameras show nothing new."""
+        self._supervisor.inhibit(topics)
 
     def _topic_of(self, camera: str, transport: str) -> tuple[str, str]:
-        """Topic and type to subscribe to: the other one of the pair when that is asked for and there."""
+        """Topic and type to subscribe to: that with the requested transport if it exists, else the camera's
+        own."""
         type = self._topics.get(camera, "")
         other = camera
         if transport == "compressed" and type != COMPRESSED:
@@ -117,21 +122,21 @@ class DaemonCameras:
             self._changed()
 
     def _changed(self) -> None:
-        if self._told is not None and self._timer is None:
-            wait = max(0.0, self._told_at + TELL_EVERY - self._clock.seconds())
-            self._timer = self._clock.callLater(wait, self._tell_again)
+        if self._reported is not None and self._timer is None:
+            wait = max(0.0, self._reported_at + REPORT_INTERVAL - self._clock.seconds())
+            self._timer = self._clock.callLater(wait, self._report_again)
 
-    def _tell_again(self) -> None:
+    def _report_again(self) -> None:
         self._timer = None
-        if self._told is not None:
-            self._tell()
+        if self._reported is not None:
+            self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         cameras = self._cameras()
-        if cameras != self._told:
-            self._told = cameras
-            self._told_at = self._clock.seconds()
-            self._say(link.Cameras(cameras=cameras, streams=self._keeper.most))
+        if cameras != self._reported:
+            self._reported = cameras
+            self._reported_at = self._clock.seconds()
+            self._send(link.Cameras(cameras=cameras, streams=self._supervisor.max_streams))
 
     def _cameras(self) -> list[link.Camera]:
         types = {**self._topics, **dict.fromkeys(self._configured, "")}

@@ -16,34 +16,33 @@ from twisted.python.threadpool import ThreadPool
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from robot_client.camera import check_installed
-from robot_client.camera.frame import Encoded, EncodeRequest, Frame
+from robot_client.camera.frame import Encoded, EncodeRequest, Frame, FrameSource, LatestFrame
 from robot_client.camera.ipc import (
-    Answer,
+    CameraMessage,
     CameraSettings,
     CloseStream,
-    Line,
+    DaemonMessage,
+    InhibitTopics,
     LogLine,
-    NoFrames,
     OpenStream,
     StreamAccepted,
     StreamEnded,
 )
-from robot_client.camera.latest_frame import LatestFrame, Origin
-from robot_client.camera.rtt_probe import RttProbe
-from robot_client.camera.stream import Busy, EncodedStream
-from robot_client.link.protocol import VideoLink
+from robot_client.camera.rate_control import RttProbe
+from robot_client.camera.stream import EncodedStream, StreamLimitReached
+from robot_client.link.links import VideoLink
 from robot_client.link.tls import endpoint, explain, split_address
 from robot_client.link.transport import LinkProtocol
 from robot_client.twisted_types import DelayedCall
 
 LINGER = 30.0
-"""Seconds for which a slow camera is kept that nobody watches: who comes again in vain finds what came meanwhile. The
-process does not live longer without streams either.
+"""Seconds for which a slow camera stays open without viewers, so that the next viewer gets the frame that
+arrived meanwhile. The process does not live longer without streams either.
 """
 
 
 class CameraSource(NamedTuple):
-    """What makes two streams share a camera: all by which it is opened, and nothing else.
+    """Everything by which a camera is opened; streams with the same value share it.
 
     :param topic: empty for a camera without ROS
     :param compressed: as in :class:`~robot_client.camera.ipc.OpenStream`
@@ -57,11 +56,11 @@ class CameraSource(NamedTuple):
     address: str = ""
 
 
-def _source_of(line: OpenStream) -> CameraSource:
-    if line.topic:
-        return CameraSource(line.topic, line.compressed, line.settings.qos)
-    # Quality of service is ROS's; what is no topic may be there to be opened once.
-    return CameraSource(address=line.source)
+def _source_of(request: OpenStream) -> CameraSource:
+    if request.topic:
+        return CameraSource(request.topic, request.compressed, request.settings.qos)
+    # Without the quality of service, which is ROS's: a device can be opened only once.
+    return CameraSource(address=request.source)
 
 
 def _ros_cameras(node: str) -> Any:
@@ -73,11 +72,11 @@ def _ros_cameras(node: str) -> Any:
 
 
 class StreamManager:
-    """Opens and closes streams as the daemon says.
+    """Opens and closes streams as the daemon requests.
 
     :param reactor: its clock must be monotonic
-    :param tell: to the daemon
-    :param make_ros: makes the node of this process, by its name, when the first camera of ROS is wanted; raises
+    :param send: sends a message to the daemon
+    :param build_ros: builds the node of this process, by its name, for the first ROS camera; raises
         :class:`Unavailable`
     """
 
@@ -85,236 +84,245 @@ class StreamManager:
         self,
         reactor: Any,
         settings: CameraSettings,
-        tell: Callable[[Answer], None],
-        make_ros: Callable[[str], Any] = _ros_cameras,
+        send: Callable[[CameraMessage], None],
+        build_ros: Callable[[str], Any] = _ros_cameras,
     ) -> None:
         self._reactor = reactor
         self._settings = settings
-        self._tell = tell
+        self._send = send
         self._streams: dict[str, EncodedStream] = {}
         self._dialling: dict[str, Deferred[Any]] = {}
-        self._make_ros = make_ros
-        self._feeds: dict[CameraSource, LatestFrame] = {}
+        self._build_ros = build_ros
+        self._cameras: dict[CameraSource, LatestFrame] = {}
         self._lingering: dict[CameraSource, DelayedCall] = {}
-        """Feeds nobody watches, and when they end."""
+        """Cameras without viewers, and the timers that close them."""
         self._views: set[_CameraView] = set()
-        self._ways: WeakValueDictionary[str, RttProbe] = WeakValueDictionary()
-        """To the relays, by address; each is kept by its streams."""
+        self._rtt_probes: WeakValueDictionary[str, RttProbe] = WeakValueDictionary()
+        """By address of the relay; its streams keep each alive."""
         self._ros: Any = None
-        self._silent: frozenset[str] = frozenset()
-        self._threads = ThreadPool(0, settings.streams, "pictures")
+        self._inhibited: frozenset[str] = frozenset()
+        self._threads = ThreadPool(0, settings.streams, "encoding")
         self._threads.start()
 
-    def take(self, line: Line) -> None:
-        """One line of the daemon."""
-        if isinstance(line, OpenStream):
-            self._open(line)
-        elif isinstance(line, CloseStream):
-            self._close(line.stream, line.why)
-        elif isinstance(line, NoFrames):
-            before, self._silent = self._silent, frozenset(line.topics)
-            for source, feed in list(self._feeds.items()):
-                if source.topic in before - self._silent:
-                    feed.speak()
+    def handle(self, message: DaemonMessage) -> None:
+        """Handle a message of the daemon."""
+        if isinstance(message, OpenStream):
+            self._open(message)
+        elif isinstance(message, CloseStream):
+            self._close(message.stream, message.reason)
+        elif isinstance(message, InhibitTopics):
+            before, self._inhibited = self._inhibited, frozenset(message.topics)
+            for source, camera in list(self._cameras.items()):
+                if source.topic in before - self._inhibited:
+                    camera.release()
 
-    def stop(self, why: str) -> None:
-        """Close all, and leave the graph; what was written still leaves."""
+    def stop(self, reason: str) -> None:
+        """Close all streams and the node; what was written is still sent."""
         for name in {*self._dialling, *self._streams}:
-            self._close(name, why)
+            self._close(name, reason)
         for source in list(self._lingering):
-            self._end(source)
+            self._close_camera(source)
         ros, self._ros = self._ros, None
         if ros is not None:
             ros.close()
 
     # --- streams -------------------------------------------------------------------------------------------
 
-    def _open(self, line: OpenStream) -> None:
-        self._tell(StreamAccepted(stream=line.stream))
-        self._close(line.stream, "it is opened anew")
-        factory = Factory.forProtocol(lambda: self._make_protocol(line))
+    def _open(self, request: OpenStream) -> None:
+        self._send(StreamAccepted(stream=request.stream))
+        self._close(request.stream, "the relay opened it again")
+        factory = Factory.forProtocol(lambda: self._build_protocol(request))
         factory.noisy = False
         own = self._settings
         try:
-            host, port = split_address(line.address or own.address)
-            where = endpoint(self._reactor, host, port, own.tls, own.ca, own.server_name)
+            host, port = split_address(request.address or own.address)
+            relay = endpoint(self._reactor, host, port, own.tls, own.ca, own.server_name)
         except SwitchboardError as error:
-            self._tell(StreamEnded(stream=line.stream, why=str(error)))
+            self._send(StreamEnded(stream=request.stream, reason=str(error)))
             return
-        self._dialling[line.stream] = attempt = where.connect(factory)
-        attempt.addErrback(self._unreachable, line.stream)
-        attempt.addBoth(lambda _: self._dialled(line.stream, attempt))
+        self._dialling[request.stream] = attempt = relay.connect(factory)
+        attempt.addErrback(self._dial_failed, request.stream)
+        attempt.addBoth(lambda _: self._dialled(request.stream, attempt))
 
-    def _make_protocol(self, line: OpenStream) -> LinkProtocol:
-        video = VideoLink(line.ticket, now_ns, line.heartbeat)
-        return LinkProtocol(video, lambda protocol: self._make_stream(line, protocol), self._reactor)
+    def _build_protocol(self, request: OpenStream) -> LinkProtocol:
+        video = VideoLink(request.ticket, now_ns, request.heartbeat)
+        return LinkProtocol(video, lambda protocol: self._build_stream(request, protocol), self._reactor)
 
-    def _make_stream(self, line: OpenStream, protocol: LinkProtocol) -> EncodedStream:
-        way = self._ways.setdefault(line.address or self._settings.address, RttProbe())
+    def _build_stream(self, request: OpenStream, protocol: LinkProtocol) -> EncodedStream:
+        rtt_probe = self._rtt_probes.setdefault(request.address or self._settings.address, RttProbe())
         stream = EncodedStream(
-            line, protocol, self.watch, self._reactor, self._gone, way, self._settings.target
+            request,
+            protocol,
+            self.open_view,
+            self._reactor,
+            self._stream_closed,
+            rtt_probe,
+            self._settings.target,
         )
-        self._streams[line.stream] = stream
+        self._streams[request.stream] = stream
         return stream
 
     def _dialled(self, name: str, attempt: Deferred[Any]) -> None:
         if self._dialling.get(name) is attempt:
             del self._dialling[name]
 
-    def _unreachable(self, failure: Failure, name: str) -> None:
+    def _dial_failed(self, failure: Failure, name: str) -> None:
         if not isinstance(failure.value, CancelledError):
-            self._tell(StreamEnded(stream=name, why=explain(failure)))
+            self._send(StreamEnded(stream=name, reason=explain(failure)))
 
-    def _gone(self, stream: EncodedStream, why: str) -> None:
-        name = stream.line.stream
+    def _stream_closed(self, stream: EncodedStream, reason: str) -> None:
+        name = stream.request.stream
         if self._streams.get(name) is stream:
             del self._streams[name]
-            self._tell(StreamEnded(stream=name, why=why))
+            self._send(StreamEnded(stream=name, reason=reason))
 
-    def _close(self, name: str, why: str) -> None:
+    def _close(self, name: str, reason: str) -> None:
         attempt = self._dialling.pop(name, None)
         if attempt is not None:
             attempt.cancel()
         stream = self._streams.pop(name, None)
         if stream is not None:
-            stream.close(why)
+            stream.close(reason)
 
     # --- cameras -------------------------------------------------------------------------------------------
 
-    def watch(self, line: OpenStream, on_shot: Callable[[Frame], None]) -> _CameraView:
-        """Have a camera for a stream.
+    def open_view(self, request: OpenStream, on_frame: Callable[[Frame], None]) -> _CameraView:
+        """Open a camera for a stream.
 
-        :raises Busy: there are as many streams as there may be
+        :raises StreamLimitReached: there are as many streams as set
         :raises NotFound: there is no such camera
-        :raises Unavailable: what it takes is not installed
+        :raises Unavailable: a required package is not installed
         """
         if len(self._views) >= self._settings.streams:
-            raise Busy(f"this robot shows {self._settings.streams} streams at a time, and not one more")
-        if not line.topic and not line.source:
-            raise NotFound(f"there is no camera {line.camera} on this robot")
+            raise StreamLimitReached(
+                f"this robot is set to show at most {self._settings.streams} streams at a time"
+            )
+        if not request.topic and not request.source:
+            raise NotFound(f"there is no camera {request.camera} on this robot")
         check_installed()
-        source = _source_of(line)
-        feed = self._feeds.get(source)
-        if feed is None:
-            feed = self._feeds[source] = self._make_feed(line)
+        source = _source_of(request)
+        camera = self._cameras.get(source)
+        if camera is None:
+            camera = self._cameras[source] = self._open_camera(request)
         timer = self._lingering.pop(source, None)
         if timer is not None:
             timer.cancel()
         view = _CameraView(
-            feed, line, on_shot, self._work, lambda: self._latest(source), lambda: self._unwatch(source, view)
+            camera,
+            request,
+            on_frame,
+            self._in_thread,
+            lambda: self._latest(source),
+            lambda: self._view_closed(source, view),
         )
         self._views.add(view)
         return view
 
-    def _unwatch(self, source: CameraSource, view: _CameraView) -> None:
+    def _view_closed(self, source: CameraSource, view: _CameraView) -> None:
         self._views.discard(view)
-        feed = self._feeds[source]
-        if feed.listeners:
+        camera = self._cameras[source]
+        if camera.listeners:
             return
-        # What is no topic and gives nothing is broken, or a device that others wait for.
-        if source.topic and feed.slow:
-            self._lingering[source] = self._reactor.callLater(LINGER, self._end, source)
+        # A device that delivers nothing is broken, or other programs wait for it; so only topics stay open.
+        if source.topic and camera.slow:
+            self._lingering[source] = self._reactor.callLater(LINGER, self._close_camera, source)
             if len(self._lingering) > self._settings.streams:
-                self._end(next(iter(self._lingering)))
+                self._close_camera(next(iter(self._lingering)))
         else:
-            self._end(source)
+            self._close_camera(source)
 
-    def _end(self, source: CameraSource) -> None:
+    def _close_camera(self, source: CameraSource) -> None:
         timer = self._lingering.pop(source, None)
         if timer is not None and timer.active():
             timer.cancel()
-        self._feeds.pop(source).close()
+        self._cameras.pop(source).close()
 
-    def _make_feed(self, line: OpenStream) -> LatestFrame:
-        name = line.topic or line.camera
-        feed = LatestFrame(name, self._reactor, self._reactor.callFromThread, self._tell)
+    def _open_camera(self, request: OpenStream) -> LatestFrame:
+        name = request.topic or request.camera
+        camera = LatestFrame(name, self._reactor, self._reactor.callFromThread, self._send)
         try:
-            feed.source = self._subscribe(line, feed) if line.topic else self._capture(line, feed)
+            open_source = self._subscribe if request.topic else self._capture
+            camera.source = open_source(request, camera)
         except BaseException:
-            feed.abandon()
+            camera.cancel()
             raise
-        return feed
+        return camera
 
-    def _subscribe(self, line: OpenStream, feed: LatestFrame) -> Origin:
-        from robot_client.camera.frame_maker import message_shot
+    def _subscribe(self, request: OpenStream, camera: LatestFrame) -> FrameSource:
+        from robot_client.camera.encoder import frame_from_message
 
-        def arrived(cdr: bytes) -> None:
-            shot = message_shot(time.time_ns(), self._reactor.seconds(), cdr, line.compressed)
-            if line.topic in self._silent:
-                feed.keep(shot)
+        def on_message(cdr: bytes) -> None:
+            frame = frame_from_message(time.time_ns(), self._reactor.seconds(), cdr, request.compressed)
+            if request.topic in self._inhibited:
+                camera.withhold(frame)
             else:
-                feed.put(shot)
+                camera.put(frame)
 
-        subscribed: Origin = self._in_ros().subscribe(line.topic, line.compressed, line.settings.qos, arrived)
-        return subscribed
+        if self._ros is None:
+            self._ros = self._build_ros(self._settings.node)
+        source: FrameSource = self._ros.subscribe(
+            request.topic, request.compressed, request.settings.qos, on_message
+        )
+        return source
 
-    def _capture(self, line: OpenStream, feed: LatestFrame) -> Origin:
+    def _capture(self, request: OpenStream, camera: LatestFrame) -> FrameSource:
         from robot_client.camera.capture import Capture
-        from robot_client.camera.frame_maker import pixels_shot
+        from robot_client.camera.encoder import frame_from_pixels
 
-        def tell(level: str, text: str) -> None:
-            self._reactor.callFromThread(
-                self._tell, LogLine(level=level, text=f"camera {line.camera} {text}")
-            )
+        def on_log(level: str, text: str) -> None:
+            line = LogLine(level=level, text=f"camera {request.camera} {text}")
+            self._reactor.callFromThread(self._send, line)
 
         return Capture(
-            line.source,
-            lambda pixels: feed.put(pixels_shot(time.time_ns(), self._reactor.seconds(), pixels)),
-            tell,
+            request.source,
+            lambda pixels: camera.put(frame_from_pixels(time.time_ns(), self._reactor.seconds(), pixels)),
+            on_log,
         )
 
-    def _in_ros(self) -> Any:
-        if self._ros is None:
-            self._ros = self._make_ros(self._settings.node)
-        return self._ros
-
     def _latest(self, source: CameraSource) -> Frame | None:
-        return None if source.topic in self._silent else self._feeds[source].latest()
+        return None if source.topic in self._inhibited else self._cameras[source].latest()
 
-    def _work(
-        self, make: Callable[[Frame, EncodeRequest], Encoded], shot: Frame, wish: EncodeRequest
+    def _in_thread(
+        self, encode: Callable[[Frame, EncodeRequest], Encoded], frame: Frame, request: EncodeRequest
     ) -> Deferred[Encoded]:
-        return deferToThreadPool(self._reactor, self._threads, make, shot, wish)
+        return deferToThreadPool(self._reactor, self._threads, encode, frame, request)
 
 
 class _CameraView:
-    """A camera as one stream has it."""
+    """One stream's view of a camera; see :class:`~robot_client.camera.stream.CameraViewPort`."""
 
     def __init__(
         self,
-        feed: LatestFrame,
-        line: OpenStream,
-        on_shot: Callable[[Frame], None],
-        work: Callable[[Callable[[Frame, EncodeRequest], Encoded], Frame, EncodeRequest], Deferred[Encoded]],
+        camera: LatestFrame,
+        request: OpenStream,
+        on_frame: Callable[[Frame], None],
+        in_thread: Callable[
+            [Callable[[Frame, EncodeRequest], Encoded], Frame, EncodeRequest], Deferred[Encoded]
+        ],
         latest: Callable[[], Frame | None],
         on_close: Callable[[], None],
     ) -> None:
-        from robot_client.camera.frame_maker import FrameMaker
+        from robot_client.camera.encoder import FrameEncoder
 
-        self._feed = feed
-        self._on_shot = on_shot
-        self._work = work
-        self._maker = FrameMaker(line.settings)
+        self._camera = camera
+        self._on_frame = on_frame
+        self._in_thread = in_thread
+        self._encoder = FrameEncoder(request.settings)
         self.latest = latest
-        """Gives the newest picture there is, if it is still what the camera shows and may be shown."""
         self._on_close = on_close
-        feed.listeners.add(on_shot)
+        camera.listeners.add(on_frame)
 
     @property
     def fps(self) -> float:
-        """Pictures per second, as they came of late."""
-        return self._feed.fps
+        return self._camera.fps
 
     @property
     def latched(self) -> bool:
-        """Whether its publisher keeps the latest picture for those who come later."""
-        return self._feed.source.latched
+        return self._camera.source.latched
 
-    def make(self, shot: Frame, wish: EncodeRequest) -> Deferred[Encoded]:
-        """Make a picture to be sent, in a thread."""
-        return self._work(self._maker.make, shot, wish)
+    def encode(self, frame: Frame, request: EncodeRequest) -> Deferred[Encoded]:
+        return self._in_thread(self._encoder.encode, frame, request)
 
     def close(self) -> None:
-        """Want it no more."""
-        self._feed.listeners.discard(self._on_shot)
+        self._camera.listeners.discard(self._on_frame)
         self._on_close()

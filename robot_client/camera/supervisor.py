@@ -1,4 +1,5 @@
-"""The daemon's side of its camera process: started when pictures are wanted, started again, ended when they are not."""
+"""Supervision of the camera process: started for the first stream, restarted after failures, ended without
+streams."""
 
 from __future__ import annotations
 
@@ -10,234 +11,242 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.logger import Logger
 
 from relay_protocol.limits import CHANNEL_TICKET_SECONDS
-from robot_client.alerts import MODULE, OnAlert, nobody
+from robot_client.alerts import MODULE, OnAlert, ignore_alert
 from robot_client.camera.ipc import (
     CameraSeen,
     CameraSettings,
     CloseStream,
+    InhibitTopics,
     LogLine,
-    NoFrames,
     OpenStream,
     StreamAccepted,
     StreamEnded,
-    answer_decoder,
+    camera_decoder,
     encode,
 )
-from robot_client.child import Child
+from robot_client.child_process import ChildProcess
 from robot_client.twisted_types import DelayedCall
 
-IDLE = 30.0
-"""Seconds without a stream after which the process leaves: starting one takes a second or two."""
+IDLE_SECONDS = 30.0
+"""Seconds without a stream after which the process is ended; its start takes a second or two."""
 
-SILENT = 20.0
-"""Seconds without a word after which it is taken for frozen; its start may take some."""
+SILENT_SECONDS = 20.0
+"""Seconds without a message after which the process counts as frozen; its start may take some."""
 
-LOOK_EVERY = 5.0
-LEAVE = 2.0
+CHECK_INTERVAL = 5.0
+EXIT_SECONDS = 2.0
+"""Seconds in which the process must exit before it is killed."""
+
 RESTART = (0.5, 30.0)
+"""Shortest and longest delay before a restart, seconds."""
+
 STEADY = 30.0
-"""Seconds a process has to live for its end not to count as one more failure."""
+"""Seconds after which the end of a process counts as the first failure again."""
 
 
-class _WantedStream(NamedTuple):
-    """A stream the relay wants, and since when, seconds."""
+class _RequestedStream(NamedTuple):
+    """A requested stream, and since when, seconds."""
 
-    line: OpenStream
+    request: OpenStream
     since: float
 
 
 class CameraSupervisor:
-    """Opens and closes streams in a process that is there while there are any.
+    """Opens and closes streams in a process that lives while there are any.
 
     :param reactor: for processes and timers
-    :param settings: its first line; nodes of later processes have names that begin with ``settings.node``
+    :param settings: first message to the process; after a restart ``settings.node`` gets a suffix
     """
 
     def __init__(self, reactor: Any, settings: CameraSettings) -> None:
-        self.on_seen: Callable[[CameraSeen], None] = _ignored
-        self.on_alert: OnAlert = nobody
+        self.on_seen: Callable[[CameraSeen], None] = _ignore
+        self.on_alert: OnAlert = ignore_alert
         self._reactor = reactor
         self._settings = settings
-        self._process: Child | None = None
-        self._streams: dict[str, _WantedStream | None] = {}
-        """What the process was told; ``None`` once it has taken note."""
-        self._waiting: dict[str, _WantedStream] = {}
-        self._silent: list[str] = []
+        self._process: ChildProcess | None = None
+        self._streams: dict[str, _RequestedStream | None] = {}
+        """Streams that the process was asked to open; ``None`` once it has accepted them."""
+        self._waiting: dict[str, _RequestedStream] = {}
+        self._inhibited: list[str] = []
         self._started = 0
         self._failures = 0
-        self._missed = False
-        """Whether people were told that it is gone."""
-        self._began = self._heard = 0.0
-        self._look: DelayedCall | None = None
-        self._retry: DelayedCall | None = None
-        self._idle: DelayedCall | None = None
-        self._leaving: DelayedCall | None = None
+        self._loss_reported = False
+        self._started_at = self._last_message = 0.0
+        self._check_timer: DelayedCall | None = None
+        self._retry_timer: DelayedCall | None = None
+        self._idle_timer: DelayedCall | None = None
+        self._exit_timer: DelayedCall | None = None
         self._stopped: Deferred[None] | None = None
         self._log = Logger("camera")
 
     @property
     def pid(self) -> int | None:
-        """Process that lives now."""
+        """Id of the process, ``None`` if it is not running."""
         return self._process.transport.pid if self._process is not None else None
 
-    def open(self, line: OpenStream) -> None:
-        """Have a stream; one that has to wait for the process waits."""
+    def open(self, request: OpenStream) -> None:
+        """Open a stream, as soon as the process runs."""
         if self._stopped is None:
-            self._want(_WantedStream(line, self._reactor.seconds()))
+            self._open(_RequestedStream(request, self._reactor.seconds()))
 
-    def _want(self, wanted: _WantedStream) -> None:
-        line = wanted.line
-        _cancel(self._idle)
-        self._idle = None
-        if self._process is not None and self._leaving is None:
-            self._streams[line.stream] = wanted
-            self._process.tell(encode(line))
+    def _open(self, requested: _RequestedStream) -> None:
+        request = requested.request
+        _cancel(self._idle_timer)
+        self._idle_timer = None
+        if self._process is not None and self._exit_timer is None:
+            self._streams[request.stream] = requested
+            self._process.send(encode(request))
             return
-        self._waiting[line.stream] = wanted
-        if self._process is None and self._retry is None:
+        self._waiting[request.stream] = requested
+        if self._process is None and self._retry_timer is None:
             self._start()
 
-    def close(self, stream: str, why: str) -> None:
-        """Have it no more."""
+    def close(self, stream: str, reason: str) -> None:
+        """Close a stream."""
         self._waiting.pop(stream, None)
         if stream in self._streams and self._process is not None:
-            self._process.tell(encode(CloseStream(stream=stream, why=why)))
-        self._gone(stream)
+            self._process.send(encode(CloseStream(stream=stream, reason=reason)))
+        self._stream_closed(stream)
 
-    def close_all(self, why: str) -> None:
-        """Have none any more."""
+    def close_all(self, reason: str) -> None:
+        """Close all streams."""
         for stream in {*self._streams, *self._waiting}:
-            self.close(stream, why)
+            self.close(stream, reason)
 
-    def silence(self, topics: Iterable[str]) -> None:
-        """Let these topics say nothing, and all others speak."""
-        self._silent = sorted(topics)
-        if self._process is not None and self._leaving is None:
-            self._process.tell(encode(NoFrames(topics=self._silent)))
+    def inhibit(self, topics: Iterable[str]) -> None:
+        """Set the inhibited topics."""
+        self._inhibited = sorted(topics)
+        if self._process is not None and self._exit_timer is None:
+            self._process.send(encode(InhibitTopics(topics=self._inhibited)))
 
     @property
-    def most(self) -> int:
-        """Streams the process makes at a time."""
+    def max_streams(self) -> int:
+        """Most streams at a time."""
         return self._settings.streams
 
     def stop(self) -> Deferred[None]:
-        """Let the process leave; fires when it has."""
+        """End the process; fires when it has exited."""
         self._waiting.clear()
-        _cancel(self._retry)
-        _cancel(self._idle)
+        _cancel(self._retry_timer)
+        _cancel(self._idle_timer)
         if self._process is None:
             return succeed(None)
         self._stopped = Deferred()
-        self._leave()
+        self._end_process()
         return self._stopped
 
-    def heard(self, line: bytes) -> None:
-        """The process said something, or something in it wrote where it speaks."""
+    def on_line(self, line: bytes) -> None:
+        """Handle a line of the process; lines of libraries in it are ignored."""
         try:
-            answer = answer_decoder.decode(line)
+            message = camera_decoder.decode(line)
         except msgspec.MsgspecError:
             return
-        self._heard = self._reactor.seconds()
-        self._missed_no_more("the camera process is there again")
-        if isinstance(answer, CameraSeen):
-            self.on_seen(answer)
-        elif isinstance(answer, StreamAccepted):
-            if answer.stream in self._streams:
-                self._streams[answer.stream] = None
-        elif isinstance(answer, StreamEnded):
-            self._log.info("stream {name} ended: {why}", name=answer.stream, why=answer.why)
-            # What was not taken yet is a stream opened anew meanwhile: it is the one before that has ended.
-            if self._streams.get(answer.stream) is None:
-                self._gone(answer.stream)
-        elif isinstance(answer, LogLine):
-            {"error": self._log.error, "warn": self._log.warn}.get(answer.level, self._log.info)(
-                "{text}", text=answer.text
+        self._last_message = self._reactor.seconds()
+        self._resolve_loss("the camera process is running again")
+        if isinstance(message, CameraSeen):
+            self.on_seen(message)
+        elif isinstance(message, StreamAccepted):
+            if message.stream in self._streams:
+                self._streams[message.stream] = None
+        elif isinstance(message, StreamEnded):
+            self._log.info("stream {name} ended: {reason}", name=message.stream, reason=message.reason)
+            # A stream that is not accepted yet was opened again meanwhile: the one before it has ended.
+            if self._streams.get(message.stream) is None:
+                self._stream_closed(message.stream)
+        elif isinstance(message, LogLine):
+            {"error": self._log.error, "warn": self._log.warn}.get(message.level, self._log.info)(
+                "{text}", text=message.text
             )
 
-    def lost(self, why: str) -> None:
-        """The process is gone. What it showed the relay asks for again."""
+    def on_exit(self, reason: str) -> None:
+        """Restart the process if it had streams; the relay requests its streams again."""
         self._process = None
-        for timer in (self._look, self._leaving, self._idle):
+        for timer in (self._check_timer, self._exit_timer, self._idle_timer):
             _cancel(timer)
-        self._look = self._leaving = self._idle = None
+        self._check_timer = self._exit_timer = self._idle_timer = None
         lost, self._streams = self._streams, {}
         if self._stopped is not None:
             self._stopped.callback(None)
             return
-        for stream, wanted in lost.items():
-            if wanted is not None:
-                self._waiting.setdefault(stream, wanted)
+        for stream, requested in lost.items():
+            if requested is not None:
+                self._waiting.setdefault(stream, requested)
         if lost:
-            steady = self._reactor.seconds() - self._began >= STEADY
+            steady = self._reactor.seconds() - self._started_at >= STEADY
             self._failures = 1 if steady else self._failures + 1
-            self._missed = True
-            text = f"the camera process is gone ({why}); it is started again when it is needed"
+            self._loss_reported = True
+            text = f"the camera process ended ({reason}); it is restarted when it is needed"
             self.on_alert("error", text, MODULE, "camera")
-            least, most = RESTART
-            delay = min(most, least * 2 ** min(self._failures - 1, 16))
-            self._retry = self._reactor.callLater(delay, self._start_again)
+            shortest, longest = RESTART
+            delay = min(longest, shortest * 2 ** min(self._failures - 1, 16))
+            self._retry_timer = self._reactor.callLater(delay, self._restart)
         else:
             self._start()
 
-    def _missed_no_more(self, text: str) -> None:
-        if self._missed:
-            self._missed = False
+    def _resolve_loss(self, text: str) -> None:
+        if self._loss_reported:
+            self._loss_reported = False
             self.on_alert("info", text, MODULE, "camera", over=True)
 
-    def _start_again(self) -> None:
-        self._retry = None
+    def _restart(self) -> None:
+        self._retry_timer = None
         self._start()
 
     def _start(self) -> None:
-        """Have a process, if there is anything for it to show."""
-        self._began = self._heard = now = self._reactor.seconds()
+        """Start the process if a stream waits for it."""
+        self._started_at = self._last_message = now = self._reactor.seconds()
         self._waiting = {
             name: each for name, each in self._waiting.items() if now - each.since < CHANNEL_TICKET_SECONDS
         }
         if not self._waiting:
-            self._missed_no_more("the camera process is not needed any more")
+            self._resolve_loss("the camera process is not needed any more")
             return
-        self._process = process = Child(self)
+        self._process = process = ChildProcess(self)
         try:
             process.start(self._reactor, ["-m", "robot_client.camera.main"])
         except OSError as error:
             self._streams, self._waiting = dict(self._waiting), {}
-            self.lost(f"it can't be started: {error.strerror}")
+            self.on_exit(f"it can't be started: {error.strerror}")
             return
-        # The network remembers a dead node for a while; one of the same name would be mistaken for it.
+        # DDS remembers a dead node for a while, and would take one of the same name for it.
         node = f"{self._settings.node}_{self._started}" if self._started else self._settings.node
         self._started += 1
-        process.tell(encode(msgspec.structs.replace(self._settings, node=node)))
-        if self._silent:
-            process.tell(encode(NoFrames(topics=self._silent)))
-        self._look = self._reactor.callLater(LOOK_EVERY, self._watch)
+        process.send(encode(msgspec.structs.replace(self._settings, node=node)))
+        if self._inhibited:
+            process.send(encode(InhibitTopics(topics=self._inhibited)))
+        self._check_timer = self._reactor.callLater(CHECK_INTERVAL, self._check)
         waiting, self._waiting = self._waiting, {}
-        for wanted in waiting.values():
-            self._want(wanted)
+        for requested in waiting.values():
+            self._open(requested)
 
-    def _watch(self) -> None:
-        self._look = None
+    def _check(self) -> None:
+        self._check_timer = None
         if self._process is None:
             return
-        if self._reactor.seconds() - self._heard > SILENT:
-            self._log.warn("the camera process says nothing any more; it is ended")
+        if self._reactor.seconds() - self._last_message > SILENT_SECONDS:
+            self._log.warn("the camera process sends nothing any more; it is killed")
             self._process.kill()
             return
-        self._look = self._reactor.callLater(LOOK_EVERY, self._watch)
+        self._check_timer = self._reactor.callLater(CHECK_INTERVAL, self._check)
 
-    def _gone(self, stream: str) -> None:
+    def _stream_closed(self, stream: str) -> None:
         self._streams.pop(stream, None)
-        if not self._streams and self._process is not None and self._idle is None and self._leaving is None:
-            self._idle = self._reactor.callLater(IDLE, self._leave)
+        if (
+            not self._streams
+            and self._process is not None
+            and self._idle_timer is None
+            and self._exit_timer is None
+        ):
+            self._idle_timer = self._reactor.callLater(IDLE_SECONDS, self._end_process)
 
-    def _leave(self) -> None:
-        self._idle = None
-        if self._process is not None and self._leaving is None:
-            self._process.leave()
-            self._leaving = self._reactor.callLater(LEAVE, self._process.kill)
+    def _end_process(self) -> None:
+        self._idle_timer = None
+        if self._process is not None and self._exit_timer is None:
+            self._process.close()
+            self._exit_timer = self._reactor.callLater(EXIT_SECONDS, self._process.kill)
 
 
-def _ignored(*what: object) -> None:
+def _ignore(*what: object) -> None:
     pass
 
 

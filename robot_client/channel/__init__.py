@@ -1,1 +1,1 @@
-"""One channel: the relay's messages become actions on the platform."""
+"""One channel: carries out the relay's requests on the platform, and sends the platform's samples to the relay."""

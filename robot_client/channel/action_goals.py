@@ -1,4 +1,4 @@
-"""Goals that the relay asks the robot's actions to pursue, on one channel."""
+"""Goals that the relay sends to the robot's actions, on one channel."""
 
 from __future__ import annotations
 
@@ -6,175 +6,175 @@ from twisted.python.failure import Failure
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
-from robot_client.channel.parts import ChannelPart, ChannelWriter, arguments, check_room
+from robot_client.channel.handler import ChannelHandler, ChannelWriter, check_room, decode_cdr
 from robot_client.link.clock_offset import ClockOffset
 from robot_client.motion.active_goals import ActiveGoals
-from robot_client.motion.gate import MotionGate
-from robot_client.platforms.base import ABORTED, NEVER_BEGAN, GoalHandle, GoalOutcome, Platform
+from robot_client.motion.request_gate import MotionRequestGate
+from robot_client.platforms.base import ABORTED, NOT_STARTED, GoalHandle, GoalOutcome, Platform
 from robot_client.twisted_types import ReactorClock
 
-ASK_EVERY = 1.0
-"""Seconds in which the relay can have one goal cancelled once. A change of control, a stop or a lost link wait for
-nothing.
-"""
+CANCEL_INTERVAL = 1.0
+"""Seconds between two cancel requests of the relay for one goal that are passed on. A change of control, a
+stop or a lost link cancel without this limit."""
 
 
-class ChannelGoals(ChannelPart):
-    """The goals under way; each ends in exactly one ``action_result``.
+class ChannelGoals(ChannelHandler):
+    """Open goals; each ends in exactly one ``action_result``.
 
-    While the link takes nothing, only the newest feedback of each goal is kept: it is the one kind of JSON message
-    that comes as often as somebody else likes.
+    While the link is full, only the newest feedback of each goal is kept. Only for feedback does a node of the robot
+    choose the rate of JSON messages.
 
     :param gate: judges goals that move the robot
-    :param offset: clock offset of the link they come on
-    :param clock: for the time alone
-    :param pursuits: sees that those that move the robot end with the daemon
+    :param offset: clock offset of this link
+    :param active_goals: ends goals that move the robot when the daemon ends
     """
 
     def __init__(
         self,
-        wire: ChannelWriter,
+        writer: ChannelWriter,
         platform: Platform,
         frame_limit: int,
-        gate: MotionGate,
+        gate: MotionRequestGate,
         offset: ClockOffset,
         clock: ReactorClock,
-        pursuits: ActiveGoals | None = None,
+        active_goals: ActiveGoals | None = None,
     ) -> None:
-        super().__init__(wire, platform, frame_limit)
-        self._pursuits = pursuits
+        super().__init__(writer, platform, frame_limit)
+        self._active_goals = active_goals
         self._gate = gate
         self._offset = offset
         self._clock = clock
         self._goals: dict[str, GoalHandle] = {}
         self._moving: set[str] = set()
-        """Those whose actions move the robot."""
-        self._again: dict[str, float] = {}
-        """When the relay may have one cancelled once more, seconds."""
+        """Ids of goals that move the robot."""
+        self._next_cancel: dict[str, float] = {}
+        """When the relay may cancel a goal again, by id, seconds."""
         self._paused = False
-        self._held: dict[str, link.ActionFeedback] = {}
+        self._held_feedback: dict[str, link.ActionFeedback] = {}
         self._closed = False
 
-    def begin(self, message: link.SendActionGoal) -> None:
-        """Pursue one.
+    def send_goal(self, message: link.SendActionGoal) -> None:
+        """Send a goal to its action.
 
-        :raises SwitchboardError: it can't be begun
+        :raises SwitchboardError: it can't be sent
         """
         id = message.id
         if id in self._goals:
-            # An action_result of this id would end the goal that is under way.
-            reason = f"a goal with the id '{id}' is under way"
-            self._wire.say(link.Failed(what="send_action_goal", ref=id, reason=reason))
+            # An action_result with this id would end the goal that is open.
+            reason = f"a goal with the id '{id}' is already open"
+            self._writer.send(link.Failed(request="send_action_goal", reference=id, reason=reason))
             return
         check_room(self._goals, "goals")
-        moves = self._gate.goal(message.action, message.source, message.stamp, self._offset)
-        pursuits = self._pursuits if moves else None
-        full = self._platform.full_name(message.action, "action") if pursuits is not None else ""
-        if pursuits is not None:
-            pursuits.check(full)
-        goal = self._platform.pursue(
+        moves = self._gate.check_goal(message.action, message.source, message.stamp, self._offset)
+        active_goals = self._active_goals if moves else None
+        full_name = ""
+        if active_goals is not None:
+            full_name = self._platform.full_name(message.action, "action")
+            active_goals.check(full_name)
+        goal = self._platform.send_goal(
             message.action,
             message.type,
-            arguments(message.cdr, message.action),
-            (lambda body: self._feedback(id, message.action, body)) if message.feedback else None,
+            decode_cdr(message.cdr, message.action),
+            (lambda body: self._send_feedback(id, message.action, body)) if message.feedback else None,
         )
         self._goals[id] = goal
         if moves:
             self._moving.add(id)
-        if pursuits is not None:
-            pursuits.add(full, goal)
+        if active_goals is not None:
+            active_goals.add(full_name, goal)
         goal.result.addCallbacks(
             lambda outcome: self._ended(message, outcome), lambda failure: self._failed(message, failure)
         )
 
     def cancel(self, message: link.CancelActionGoal) -> None:
-        """The relay wants it no more; one that has ended already is passed over, and what follows within a second."""
+        """Request cancellation; ignored for goals that have ended, and within :data:`CANCEL_INTERVAL`."""
         goal = self._goals.get(message.id)
         now = self._clock.seconds()
-        if goal is not None and now >= self._again.get(message.id, now):
-            self._again[message.id] = now + ASK_EVERY
+        if goal is not None and now >= self._next_cancel.get(message.id, now):
+            self._next_cancel[message.id] = now + CANCEL_INTERVAL
             goal.cancel()
 
     def cancel_all(self, only_moving: bool) -> None:
-        """The robot is to stop; the results still come.
+        """Cancel all goals; their results still arrive.
 
-        :param only_moving: goals of actions that don't move it go on
+        :param only_moving: whether goals that don't move the robot continue
         """
         for id, goal in list(self._goals.items()):
             if not only_moving or id in self._moving:
-                self._end(goal)
+                self._cancel_safely(goal)
 
     def pause(self) -> None:
-        """The link takes nothing."""
+        """Hold feedback, as the link is full."""
         self._paused = True
 
     def resume(self) -> None:
-        """The link takes messages again."""
+        """Send held feedback, as the link has room."""
         self._paused = False
-        held, self._held = self._held, {}
+        held, self._held_feedback = self._held_feedback, {}
         for message in held.values():
-            self._wire.say(message)
+            self._writer.send(message)
 
     def close(self) -> None:
-        """Nobody wants any of them now."""
+        """Cancel all goals; nothing is sent any more."""
         self._closed = True
-        self._held.clear()
+        self._held_feedback.clear()
         for goal in list(self._goals.values()):
-            self._end(goal)
+            self._cancel_safely(goal)
         self._goals.clear()
         self._moving.clear()
-        self._again.clear()
+        self._next_cancel.clear()
 
-    def _end(self, goal: GoalHandle) -> None:
+    def _cancel_safely(self, goal: GoalHandle) -> None:
         try:
             goal.cancel()
-        except Exception:  # one that fails must not keep the next from its end
+        except Exception:  # must not prevent the cancellation of the others
             self._log.failure("a goal could not be cancelled")
-        if self._pursuits is not None:
-            self._pursuits.end(goal)
+        if self._active_goals is not None:
+            self._active_goals.note_cancelled(goal)
 
-    def _feedback(self, id: str, action: str, body: bytes) -> None:
+    def _send_feedback(self, id: str, action: str, body: bytes) -> None:
         if id not in self._goals:
             return
         try:
-            message = link.ActionFeedback(id=id, cdr=self._to_cdr(body, f"feedback of {action}"))
+            message = link.ActionFeedback(id=id, cdr=self._encode_cdr(body, f"feedback of {action}"))
         except SwitchboardError as error:
-            self._log.warn("feedback is left out: {reason}", reason=str(error))
+            self._log.warn("feedback is dropped: {reason}", reason=str(error), limited="feedback")
             return
         if self._paused:
-            self._held[id] = message
+            self._held_feedback[id] = message
         else:
-            self._wire.say(message)
+            self._writer.send(message)
 
     def _ended(self, message: link.SendActionGoal, outcome: GoalOutcome) -> None:
         if outcome.body is None:
-            self._say_end(message.id, outcome.status, None, outcome.reason)
+            self._send_result(message.id, outcome.status, None, outcome.reason)
             return
         try:
-            cdr = self._to_cdr(outcome.body, f"the result of {message.action}")
+            cdr = self._encode_cdr(outcome.body, f"the result of {message.action}")
         except SwitchboardError as error:
-            self._say_end(message.id, outcome.status, None, str(error))
+            self._send_result(message.id, outcome.status, None, str(error))
             return
-        self._say_end(message.id, outcome.status, cdr, "")
+        self._send_result(message.id, outcome.status, cdr, "")
 
     def _failed(self, message: link.SendActionGoal, failure: Failure) -> None:
         self._log.failure("a goal of {action} failed", failure, action=message.action)
-        self._say_end(message.id, ABORTED, None, "the robot lost this goal; its log says why")
+        reason = "the robot could not follow this goal to its end; the robot's log says why"
+        self._send_result(message.id, ABORTED, None, reason)
 
-    def _say_end(self, id: str, status: int, cdr: str | None, reason: str) -> None:
+    def _send_result(self, id: str, status: int, cdr: str | None, reason: str) -> None:
         self._goals.pop(id, None)
         self._moving.discard(id)
-        self._again.pop(id, None)
-        feedback = self._held.pop(id, None)
+        self._next_cancel.pop(id, None)
+        feedback = self._held_feedback.pop(id, None)
         if self._closed:
             return
         if feedback is not None:
-            self._wire.say(feedback)
-        self._wire.say(
+            self._writer.send(feedback)
+        self._writer.send(
             link.ActionResult(id=id, status=status, result=cdr is not None, cdr=cdr, reason=reason)
         )
 
 
 def refusal(message: link.SendActionGoal, reason: str) -> link.ActionResult:
-    """The answer to a goal that could not be begun."""
-    return link.ActionResult(id=message.id, status=NEVER_BEGAN, result=False, reason=reason)
+    """The result of a goal that could not be sent."""
+    return link.ActionResult(id=message.id, status=NOT_STARTED, result=False, reason=reason)

@@ -1,4 +1,4 @@
-"""When to dial again: exponential backoff with full jitter, quick at first, never giving up."""
+"""Delays before dialling again: exponential backoff with full jitter, and a low cap in the first minute."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ FIRST = 0.5
 CAP = 15.0
 CAP_OF_FRESH_OUTAGE = 2.0
 FRESH_OUTAGE = 60.0
-"""A relay that restarts is back within a minute: until then robots dial often enough to be back with it."""
+"""Seconds. A relay that restarts is back within a minute, so robots dial often during that time."""
 
 STEADY = 10.0
-"""A link that was registered this long was a good one; the next outage starts afresh."""
+"""Seconds a link must have been registered for the backoff to start over."""
 
 REFUSED = (30.0, 60.0)
-"""When only a person can help, asking more often helps nobody."""
+"""Least and most seconds to wait when only a person can resolve the refusal."""
 
 _DOUBLINGS = 16
 
 
 class Backoff:
-    """Counts failures and says how long to wait.
+    """Computes delays from the failures so far.
 
-    :param random: gives numbers in [0, 1)
+    :param random: returns numbers in [0, 1)
     """
 
     def __init__(self, random: Callable[[], float]) -> None:
@@ -45,11 +45,11 @@ class Backoff:
         return delay
 
     def after_refusal(self, retry_after: float | None) -> float:
-        """Seconds to wait after the relay said no.
+        """Seconds to wait after the relay refused the robot.
 
-        :param retry_after: what the relay asked for, seconds; ``None`` when only a person can help
+        :param retry_after: seconds the relay requested; ``None`` if only a person can resolve the refusal
         """
-        least, most = REFUSED
+        shortest, longest = REFUSED
         if retry_after is None:
-            return least + self._random() * (most - least)
+            return shortest + self._random() * (longest - shortest)
         return max(0.0, retry_after) * (1.0 + 0.1 * self._random()) + self._random() * FIRST

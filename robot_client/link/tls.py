@@ -1,4 +1,4 @@
-"""TLS towards the relay: name and chain are checked, and what fails is said in words."""
+"""Endpoints for dialling the relay, with TLS or plain, and connection errors as text for people."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PEM_END = b"-----END CERTIFICATE-----"
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine, where nobody listens in."""
+    """Whether a host is this machine, so that plain connections can't be observed."""
     if host == "localhost" or host.endswith(".localhost"):
         return True
     try:
@@ -36,7 +36,7 @@ def is_loopback(host: str) -> bool:
 def trust_root(ca: str) -> Any:
     """The authorities in a PEM file.
 
-    :raises Invalid: no such file, or no certificate in it
+    :raises Invalid: the file can't be read or holds no certificate
     """
     try:
         text = Path(ca).read_bytes()
@@ -45,7 +45,7 @@ def trust_root(ca: str) -> Any:
     except OSError as problem:
         raise Invalid(f"the CA file {ca} can't be read: {problem.strerror}") from None
     except SSL.Error:
-        raise Invalid(f"the CA file {ca} holds something that is no certificate in PEM form") from None
+        raise Invalid(f"the CA file {ca} holds a block that is not a certificate in PEM form") from None
     if not certificates:
         raise Invalid(f"the CA file {ca} holds no certificate in PEM form")
     return ssl.trustRootFromCertificates(certificates)
@@ -54,11 +54,11 @@ def trust_root(ca: str) -> Any:
 def endpoint(
     reactor: Any, host: str, port: int, tls: bool, ca: str = "", server_name: str = ""
 ) -> DialEndpoint:
-    """Where to dial.
+    """The relay's endpoint.
 
-    :param ca: PEM file of the only authorities trusted; empty for the system's
-    :param server_name: name the certificate must bear; empty for ``host``
-    :raises Invalid: the CA file, or the name, can't be used
+    :param ca: PEM file of the only trusted authorities; empty for the system's
+    :param server_name: name in the relay's certificate; empty for ``host``
+    :raises Invalid: the CA file or the name can't be used
     """
     plain: Any = HostnameEndpoint(reactor, host, port, timeout=CONNECT_SECONDS)
     if not tls:
@@ -71,21 +71,21 @@ def endpoint(
             trustRoot=trusted,
             extraCertificateOptions={"raiseMinimumTo": ssl.TLSVersion.TLSv1_2},
         )
-    except ValueError:  # that of idna, too
-        raise Invalid(f"'{name}' can't be the name in a certificate; see --server-name") from None
-    return cast(DialEndpoint, wrapClientTLS(cast(Any, _InWords(options, name)), plain))
+    except ValueError:  # also the base of idna's errors
+        raise Invalid(f"'{name}' can't be the name in a certificate; set --server-name") from None
+    return cast(DialEndpoint, wrapClientTLS(cast(Any, _ExplainingTls(options, name)), plain))
 
 
 class CertificateRefused(Refused):
-    """The relay's certificate is not good; nothing was said to it."""
+    """The relay's certificate was refused; nothing was sent to it."""
 
 
 @implementer(IOpenSSLClientConnectionCreator)
-class _InWords:
-    """Twisted's TLS client, whose checks are made with the reason kept: OpenSSL's error only says *failed*.
+class _ExplainingTls:
+    """Twisted's TLS client with checks that give the reason of a failure; OpenSSL's error only says *failed*.
 
-    :param inner: makes the connections
-    :param name: what the certificate must be for
+    :param inner: creates the connections
+    :param name: name the certificate must have
     """
 
     def __init__(self, inner: Any, name: str) -> None:
@@ -97,11 +97,11 @@ class _InWords:
             self._id = DNS_ID(name)
 
     def clientConnectionForTLS(self, protocol: Any) -> SSL.Connection:
-        """A connection that checks chain and name."""
+        """Create a connection that checks chain and name."""
         connection: SSL.Connection = self._inner.clientConnectionForTLS(protocol)
 
         def check(_: SSL.Connection, certificate: Any, code: int, depth: int, good: int) -> bool:
-            reason = self._fault(certificate, code, depth, bool(good))
+            reason = self._problem(certificate, code, depth, bool(good))
             if reason:
                 protocol.failVerification(Failure(CertificateRefused(reason)))
             return not reason
@@ -109,10 +109,10 @@ class _InWords:
         connection.set_verify(SSL.VERIFY_PEER | SSL.VERIFY_FAIL_IF_NO_PEER_CERT, check)
         return connection
 
-    def _fault(self, certificate: Any, code: int, depth: int, good: bool) -> str:
-        """What is wrong with one certificate of the chain; empty if nothing is."""
+    def _problem(self, certificate: Any, code: int, depth: int, good: bool) -> str:
+        """Describe the fault of one certificate of the chain; empty if it has none."""
         if not good:
-            return _CHAIN_WORDS.get(
+            return _CHAIN_TEXTS.get(
                 code, f"the relay's certificate can't be verified (OpenSSL's reason {code})"
             )
         if depth > 0:
@@ -120,16 +120,16 @@ class _InWords:
         try:
             verify_service_identity(extract_patterns(certificate), [self._id], [])
         except (VerificationError, CertificateError):
-            return f"the relay's certificate is for another name than {self._name}; see --server-name"
-        except Exception:  # an exception in OpenSSL's callback would be lost, and the certificate taken
+            return f"the relay's certificate is for another name than {self._name}; set --server-name if it is right"
+        except Exception:  # an exception in OpenSSL's callback would be lost and the certificate accepted
             return "the relay's certificate can't be read"
         return ""
 
 
-_UNTRUSTED = "the relay's certificate is of nobody this robot trusts; give its CA as --ca"
+_UNTRUSTED = "the relay's certificate is not issued by an authority this robot trusts; give its CA with --ca"
 _CODES = SSL.X509VerificationCodes
-_CHAIN_WORDS = {
-    _CODES.ERR_CERT_HAS_EXPIRED: "the relay's certificate has expired; it must be renewed there",
+_CHAIN_TEXTS = {
+    _CODES.ERR_CERT_HAS_EXPIRED: "the relay's certificate has expired; renew it on the relay",
     _CODES.ERR_CERT_NOT_YET_VALID: "the relay's certificate is not valid yet; compare the clocks of both machines",
     _CODES.ERR_DEPTH_ZERO_SELF_SIGNED_CERT: _UNTRUSTED,
     _CODES.ERR_SELF_SIGNED_CERT_IN_CHAIN: _UNTRUSTED,
@@ -139,21 +139,21 @@ _CHAIN_WORDS = {
 
 
 def explain(failure: Failure) -> str:
-    """Why a connection failed or ended, for a person."""
+    """The reason why a connection failed or ended, as text for people."""
     problem = failure.value
     if isinstance(problem, SwitchboardError):
         return str(problem)
     if isinstance(problem, SSL.Error):
         return _explain_tls(problem)
-    for kind, words in _WORDS.items():
+    for kind, text in _ERROR_TEXTS.items():
         if isinstance(problem, kind):
-            return words
+            return text
     return f"the connection failed: {problem}"
 
 
-_WORDS: dict[type[BaseException], str] = {
+_ERROR_TEXTS: dict[type[BaseException], str] = {
     error.ConnectionDone: "the relay closed the connection",
-    error.ConnectionRefusedError: "nobody listens at the relay's address",
+    error.ConnectionRefusedError: "the relay's address refuses connections; check that the relay is running",
     error.DNSLookupError: "the relay's host name can't be resolved",
     error.TimeoutError: "the relay can't be reached: no answer in time",
     error.NoRouteError: "there is no route to the relay",
@@ -161,26 +161,26 @@ _WORDS: dict[type[BaseException], str] = {
     error.ConnectionLost: "the connection to the relay broke",
 }
 
-_TLS_WORDS = {
-    "wrong version number": "the relay does not speak TLS on this port; for a trusted network say --no-tls",
-    "unexpected eof": "the relay ended the TLS connection early; does it speak TLS on this port?",
+_TLS_TEXTS = {
+    "wrong version number": "the relay does not use TLS on this port; in a trusted network use --no-tls",
+    "unexpected eof": "the relay ended the TLS connection early; check that it uses TLS on this port",
 }
 
 
 def _explain_tls(problem: SSL.Error) -> str:
     text = str(problem).lower()
-    for mark, words in _TLS_WORDS.items():
+    for mark, explanation in _TLS_TEXTS.items():
         if mark in text:
-            return words
+            return explanation
     if isinstance(problem, SSL.ZeroReturnError):
         return "the relay closed the connection"
     return "TLS with the relay failed"
 
 
 def split_address(text: str, default_port: int = 9091) -> tuple[str, int]:
-    """``host:port`` or ``[v6]:port`` in its parts.
+    """Split ``host:port`` or ``[v6]:port``.
 
-    :raises Invalid: no host, or a port that is none
+    :raises Invalid: the host is missing or the port is not valid
     """
     host, colon, port = text.rpartition(":")
     if not colon or text.endswith("]"):
@@ -194,5 +194,5 @@ def split_address(text: str, default_port: int = 9091) -> tuple[str, int]:
         or not port.isdigit()
         or not 0 < int(port) < 65536
     ):
-        raise Invalid(f"'{text}' is no address; write host:port, as in relay.example:{default_port}")
+        raise Invalid(f"'{text}' is not an address; write host:port, as in relay.example:{default_port}")
     return host.strip("[]"), int(port)

@@ -1,4 +1,8 @@
-"""The thin edge between a link and a Twisted connection: bytes, timers, backpressure, last words."""
+"""Connects a link to a Twisted transport: bytes, timers, backpressure, closing.
+
+The owner of a link receives its events: :class:`~robot_client.link.control_connection.ControlConnection`, or
+:class:`~robot_client.channel.channel.ChannelConnection` for a channel.
+"""
 
 from __future__ import annotations
 
@@ -15,42 +19,42 @@ from twisted.python.failure import Failure
 from zope.interface import implementer
 
 from relay_protocol.errors import PeerError, SwitchboardError
-from relay_protocol.limits import KIB, UNPROVEN_SECONDS
-from robot_client.link.protocol import NANO, Event, Link, LinkState
+from relay_protocol.limits import KIB, UNAUTHENTICATED_SECONDS
+from robot_client.link.links import NANO, Event, Link, LinkState
 from robot_client.link.tls import explain
 from robot_client.twisted_types import DelayedCall, ReactorClock
 
-GOODBYE_SECONDS = 2.0
-"""How long the last words may take to leave; a relay that takes nothing would hold the connection for ever."""
+CLOSE_SECONDS = 2.0
+"""Seconds in which the last messages must be sent: a relay that reads nothing would keep the connection open."""
 
-MOST_AT_ONCE = 64 * KIB
-"""Bytes of samples written at a time."""
+MAX_WRITE = 64 * KIB
+"""Most bytes of samples written at a time."""
 
-_SPACING = KIB
-"""Bytes of samples between two probes, at least; else a quarter of the window."""
+_PROBE_SPACING = KIB
+"""Least bytes of samples between two probes; a quarter of the window if that is more."""
 
-_UNSENT = 64 * KIB
-"""Bytes the kernel may hold unsent; more would be delay nobody sees."""
+_KERNEL_UNSENT = 64 * KIB
+"""Most unsent bytes in the kernel, where they would be an unnoticed delay (``TCP_NOTSENT_LOWAT``)."""
 
-_UNWRITTEN = 32 * KIB
-"""Bytes written to TLS that make it pause: one part of a large sample fills it, and nothing small has to wait behind
-a second one. A plain connection pauses with the first byte the socket does not take.
+_TLS_BUFFER = 32 * KIB
+"""Buffered bytes at which a TLS connection pauses: one part of a large sample, so that small samples never
+wait behind two. A plain connection pauses with the first byte that the socket does not accept.
 """
 
 _TCP_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", 25 if sys.platform == "linux" else None)
 _TCP_USER_TIMEOUT = getattr(socket, "TCP_USER_TIMEOUT", None)
 
-_UNKNOWN = frozenset((LinkState.GREETING, LinkState.PROVING, LinkState.ENROLLING, LinkState.JOINING))
+_UNPROVEN = frozenset((LinkState.GREETING, LinkState.PROVING, LinkState.ENROLLING, LinkState.JOINING))
 
 
 class LinkOwner(Protocol):
-    """Who is told what happens on a link."""
+    """Receives the events of a link."""
 
     def on_event(self, event: Event) -> None:
-        """The relay said something."""
+        """The link decoded an event."""
 
     def on_lost(self, reason: SwitchboardError) -> None:
-        """The link is gone; called once."""
+        """The link is lost; called once."""
 
     def on_pause(self) -> None:
         """The transport is full."""
@@ -60,90 +64,88 @@ class LinkOwner(Protocol):
 
 
 class LinkLost(SwitchboardError):
-    """A link ended; the text says why."""
+    """A link ended; the text is the reason."""
 
 
 @implementer(IPushProducer)
 class LinkProtocol(TwistedProtocol):
-    """Carries one link.
+    """The Twisted protocol of one link.
 
+    :param build_owner: called once, with this protocol
     :param clock: for heartbeats and deadlines
     """
 
     transport: Any
 
     def __init__(
-        self, link: Link, make_owner: Callable[[LinkProtocol], LinkOwner], clock: ReactorClock
+        self, link: Link, build_owner: Callable[[LinkProtocol], LinkOwner], clock: ReactorClock
     ) -> None:
         self.link = link
-        self.owner = make_owner(self)
+        self.owner = build_owner(self)
         self._clock = clock
-        self._ping: DelayedCall | None = None
+        self._ping_timer: DelayedCall | None = None
         self._deadline: DelayedCall | None = None
         self._socket: socket.socket | None = None
-        self._heard = False
-        self._patience: DelayedCall | None = None
+        self._received = False
+        self._close_timer: DelayedCall | None = None
         self._reason: SwitchboardError | None = None
         self._transport_full = self._window_full = False
-        self._probed = 0
-        """Bytes of samples sent when the latest probe was."""
+        self._probed_at = 0
+        """Bytes of samples that were sent before the latest probe."""
 
     def connectionMade(self) -> None:
-        """The connection stands."""
         self._socket = tune(self.transport, self.link.heartbeat * 3)
         self.transport.registerProducer(self, True)
-        self._deadline = self._clock.callLater(UNPROVEN_SECONDS, self._too_slow)
+        self._deadline = self._clock.callLater(UNAUTHENTICATED_SECONDS, self._handshake_timed_out)
         self.link.begin()
         self.flush()
 
     def dataReceived(self, data: bytes) -> None:
-        """Bytes from the relay."""
-        self._heard = True
-        if self._over():
+        self._received = True
+        if self._has_ended():
             return
         try:
             events = self.link.receive(data)
         except SwitchboardError as reason:
             self.end(reason)
             return
-        if self._deadline is not None and self.link.state not in _UNKNOWN:
+        if self._deadline is not None and self.link.state not in _UNPROVEN:
             self._deadline.cancel()
             self._deadline = None
-            self._beat()
+            self._send_heartbeat()
         for event in events:
-            if self._over():
-                return  # what came behind the end of the link must not be done any more
+            if self._has_ended():
+                return  # messages after the end of the link must not be carried out
             self.owner.on_event(event)
         self.flush()
-        self._look_at_window()
+        self._check_window()
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
-        """The connection is gone."""
-        for timer in (self._ping, self._deadline, self._patience):
+        for timer in (self._ping_timer, self._deadline, self._close_timer):
             if timer is not None and timer.active():
                 timer.cancel()
-        lost = self._reason or self._as_ours(reason)
+        lost = self._reason or self._link_error(reason)
         self._reason = lost
         self.owner.on_lost(lost)
 
     def flush(self) -> None:
-        """Write what the link has to say."""
+        """Write the messages that the link has queued."""
         out = self.link.take()
         if out and self.transport is not None:
-            self._put(b"".join(out))
+            self._write_directly(b"".join(out))
 
     def write(self, frames: list[bytes]) -> None:
-        """Write sample frames behind all that was said before."""
+        """Write sample frames after all queued messages."""
         size = sum(map(len, frames))
-        if self.link.unsaid:
+        if self.link.unsent:
             frames = [*self.link.take(), *frames]
-        self._put(b"".join(frames))
+        self._write_directly(b"".join(frames))
         window = self.link.window
         if window is None:
             return
         window.sent += size
         full = window.room(self._seconds()) <= 0
-        if full or window.sent - self._probed >= max(_SPACING, window.size / 4):
+        if full or window.sent - self._probed_at >= max(_PROBE_SPACING, window.size / 4):
             self._probe(full)
         if full and not self._window_full:
             self._window_full = True
@@ -151,21 +153,21 @@ class LinkProtocol(TwistedProtocol):
 
     @property
     def room(self) -> int:
-        """Bytes of samples that should be written now."""
+        """Bytes of samples that may be written now."""
         window = self.link.window
-        return MOST_AT_ONCE if window is None else min(MOST_AT_ONCE, int(window.room(self._seconds())))
+        return MAX_WRITE if window is None else min(MAX_WRITE, int(window.room(self._seconds())))
 
     def _probe(self, full: bool) -> None:
-        """Ping, to learn when all samples before have arrived."""
+        """Send a ping; its answer shows that all samples before it have arrived."""
         window = self.link.window
         assert window is not None
-        self._probed = window.sent
+        self._probed_at = window.sent
         self.link.ping(full)
         self.flush()
 
-    def _look_at_window(self) -> None:
+    def _check_window(self) -> None:
         window = self.link.window
-        if window is None or not self._window_full or self._over():
+        if window is None or not self._window_full or self._has_ended():
             return
         if window.room(self._seconds()) > 0:
             self._window_full = False
@@ -177,12 +179,12 @@ class LinkProtocol(TwistedProtocol):
     def _seconds(self) -> float:
         return self.link.clock() / NANO
 
-    def _put(self, data: bytes) -> None:
-        """Write at once where that can be.
+    def _write_directly(self, data: bytes) -> None:
+        """Write directly to the socket if possible.
 
-        Twisted keeps what is written until the reactor has found the socket writable: a turn and two calls to the
-        kernel more for each sample. ``_tempDataLen`` (written, not yet joined) and ``dataBuffer`` (being sent) are all
-        it keeps.
+        Twisted buffers until the reactor finds the socket writable, which costs one turn and two system
+        calls more for each sample. Its buffers are ``_tempDataLen`` (written, not joined yet) and
+        ``dataBuffer`` (being sent).
         """
         transport = self.transport
         if self._socket is None or transport.disconnecting:
@@ -191,19 +193,22 @@ class LinkProtocol(TwistedProtocol):
         if not (transport._tempDataLen or transport.dataBuffer):
             try:
                 sent = self._socket.send(data)
-            except OSError:  # full, or broken: Twisted finds out which, and tells
+            except OSError:  # full or broken: Twisted finds out which and reports it
                 sent = 0
             if sent == len(data):
                 return
             data = data[sent:]
         transport.write(data)
         if not transport.producerPaused:
-            # Twisted would take some more first; what is small would wait behind it.
+            # Twisted would accept more before it pauses, and small samples would wait behind that.
             transport.producerPaused = True
             self.pauseProducing()
 
     def end(self, reason: SwitchboardError, gently: bool = False) -> None:
-        """Close the connection; ``gently`` lets what was written leave first."""
+        """Close the connection.
+
+        :param gently: whether written bytes are sent first
+        """
         if self._reason is not None:
             return
         self._reason = reason
@@ -211,20 +216,24 @@ class LinkProtocol(TwistedProtocol):
         if gently:
             self.flush()
             self.transport.loseConnection()
-            self._patience = self._clock.callLater(GOODBYE_SECONDS, self.transport.abortConnection)
+            self._close_timer = self._clock.callLater(CLOSE_SECONDS, self.transport.abortConnection)
         else:
             self.transport.abortConnection()
 
-    def _over(self) -> bool:
+    def _has_ended(self) -> bool:
         return self._reason is not None
 
-    def _as_ours(self, failure: Failure) -> SwitchboardError:
+    def _link_error(self, failure: Failure) -> SwitchboardError:
         if isinstance(failure.value, SwitchboardError):
             return failure.value
-        silent = "" if self._heard else " before it said a word; is it a relay, with TLS as it is set here?"
-        return LinkLost(explain(failure) + silent)
+        hint = (
+            ""
+            if self._received
+            else " before it sent anything; check that the address is a relay's, and that TLS is set as on the relay"
+        )
+        return LinkLost(explain(failure) + hint)
 
-    def _beat(self) -> None:
+    def _send_heartbeat(self) -> None:
         try:
             self.link.check_silence()
         except PeerError as reason:
@@ -232,40 +241,37 @@ class LinkProtocol(TwistedProtocol):
             return
         self.link.ping()
         self.flush()
-        self._ping = self._clock.callLater(self.link.ping_every, self._beat)
+        self._ping_timer = self._clock.callLater(self.link.ping_every, self._send_heartbeat)
 
     def ping_every(self, seconds: float) -> None:
-        """Ping in this rhythm from now on."""
+        """Change the interval between pings."""
         self.link.ping_every = seconds
-        if self._ping is not None and self._ping.active():
-            self._ping.cancel()
-            self._beat()
+        if self._ping_timer is not None and self._ping_timer.active():
+            self._ping_timer.cancel()
+            self._send_heartbeat()
 
-    def _too_slow(self) -> None:
+    def _handshake_timed_out(self) -> None:
         self._deadline = None
-        self.end(LinkLost(f"the relay did not answer within {UNPROVEN_SECONDS:.0f} s"))
+        self.end(LinkLost(f"the relay did not answer within {UNAUTHENTICATED_SECONDS:.0f} s"))
 
     def pauseProducing(self) -> None:
-        """The transport is full."""
         self._transport_full = True
         self.owner.on_pause()
 
     def resumeProducing(self) -> None:
-        """The transport has room."""
         self._transport_full = False
         if not self._window_full:
             self.owner.on_resume()
 
     def stopProducing(self) -> None:
-        """The transport wants no more."""
         self.owner.on_pause()
 
 
-def tune(transport: Any, patience: float) -> socket.socket | None:
-    """Set what the kernel should do: no delay, no long silent retries, little data unsent.
+def tune(transport: Any, timeout: float) -> socket.socket | None:
+    """Set socket options: no Nagle delay, a bound for unacknowledged data, little unsent data.
 
-    :param patience: seconds after which unacknowledged data means the connection is lost
-    :return: the socket, if bytes may be put on it as they are
+    :param timeout: seconds after which unacknowledged data means that the connection is lost
+    :return: the socket if bytes may be written to it directly (no TLS), else ``None``
     """
     found = _tcp_of(transport)
     if found is None:
@@ -273,17 +279,18 @@ def tune(transport: Any, patience: float) -> socket.socket | None:
     connection, handle = found
     handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     handle.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in ((_TCP_USER_TIMEOUT, int(patience * 1000)), (_TCP_NOTSENT_LOWAT, _UNSENT)):
+    for option, value in ((_TCP_USER_TIMEOUT, int(timeout * 1000)), (_TCP_NOTSENT_LOWAT, _KERNEL_UNSENT)):
         if option is not None:
             handle.setsockopt(socket.IPPROTO_TCP, option, value)
     plain = connection is transport and type(transport) is Client and not transport.TLS
     if not plain:
-        connection.bufferSize = _UNWRITTEN
+        connection.bufferSize = _TLS_BUFFER
     return handle if plain else None
 
 
 def _tcp_of(transport: Any) -> tuple[Any, socket.socket] | None:
-    """The TCP connection under a transport, through TLS, and its socket; ``None`` in memory."""
+    """The TCP connection below a transport, through TLS, and its socket; ``None`` for transports in
+    memory."""
     while transport is not None:
         handle = getattr(transport, "getHandle", lambda: None)()
         if isinstance(handle, socket.socket):

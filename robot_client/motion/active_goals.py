@@ -1,12 +1,12 @@
-"""Goals that move the robot must not outlive the daemon that had them pursued.
+"""Goals that move the robot must not outlive the daemon that sent them.
 
-The guard hears of them as of commands on topics: of each action by the service that cancels its goals, again and again
-as long as one is under way. When that ceases, or the daemon is gone, it has them cancelled. And a note of those actions
-lies on the disk, so that a daemon whose guard died with it finds at its next start what was left.
+The guard is notified of goals as of commands: under the name of the action's cancel service, repeatedly while a goal is
+active. When the notifications end, or the daemon is gone, the guard cancels the goals. The actions are also stored on
+the disk, so that a daemon whose guard died with it can cancel leftover goals at its next start.
 
-A goal that was given up though its action may go on with it is *adrift*: it counts as under way for guard and note
-until its action, seen again, has answered that it cancels it, or knows nothing of it. One that is to end, as its driver
-has lost control or the robot is stopped, is asked to again until it has ended: an action may refuse that, and go on.
+A goal that was given up while its action may still execute it is *orphaned*. It counts as active for the guard and the
+store until its action, seen again, answers that it cancels the goal or does not know it. A goal that has to end, as its
+driver has lost control or the robot is stopped, is cancelled again until it has ended, as an action may refuse.
 """
 
 from __future__ import annotations
@@ -27,358 +27,399 @@ from robot_client.motion.stop_store import StopStore
 from robot_client.platforms.base import GoalHandle, GoalOutcome
 from robot_client.twisted_types import DelayedCall
 
-BEAT = 0.2
-"""Seconds between two words to the guard that the daemon is still there."""
+NOTIFY_GUARD_EVERY = 0.2
+"""Seconds between two notifications of the guard that a goal is still active."""
 
-KEPT = 30.0
-"""Seconds the guard stays able to cancel an action's goals after the last one ended: another may follow."""
+GUARD_CLIENT_SECONDS = 30.0
+"""Seconds the guard keeps its client of an action after the last goal ended, as another may follow."""
 
-LOOKS = 30
-"""How often to look for actions that were left goals, a second apart: nodes may be found after the daemon's start."""
+LEFTOVER_ATTEMPTS = 30
+"""Attempts, one second apart, to find actions with leftover goals: nodes may be discovered after the daemon's start."""
 
-OVERDUE = 1_000_000_000
-"""Nanoseconds a goal that is cancelled may take to end before it is asked to again."""
+CANCEL_AGAIN_AFTER = 1_000_000_000
+"""Nanoseconds a cancelled goal may take to end before it is cancelled again."""
 
-UNPROVEN = 2_000_000_000
-"""Nanoseconds without proof of the relay after which goals are cancelled: nobody who gave one could end it then."""
+LINK_UNPROVEN_AFTER = 2_000_000_000
+"""Nanoseconds without an answer of the relay after which goals are cancelled, as no client could cancel them."""
 
-ADRIFT = 600.0
-"""Seconds in which an action that was lost with a goal, or refused to cancel those it has, is looked for."""
+ORPHAN_SECONDS = 600.0
+"""Seconds for which a missing action is awaited that has an orphaned goal, or refused to cancel its goals."""
 
-MAX_ADRIFT = 64
-"""Goals adrift that are remembered."""
+MAX_ORPHANED = 64
+"""Most orphaned goals remembered."""
 
-MAX_ASKING = 64
-"""Goals that are being asked to end at a time."""
+MAX_CANCELLING = 64
+"""Most late goals that are being cancelled at a time."""
 
-FAREWELL = 1.5
-"""Seconds a daemon that leaves waits for the goals it has cancelled to end."""
+GOALS_END_SECONDS = 1.5
+"""Seconds a daemon that shuts down waits for its cancelled goals to end."""
 
 Ended = TypeVar("Ended")
 
 MAX_ACTIONS = 64
-"""Actions that are had pursue goals at a time."""
+"""Most actions that execute goals at a time."""
 
 
-class _UnderWay:
+class _ActiveGoal:
     """A goal that has not ended.
 
-    :param began: own clock, nanoseconds
+    :param began_at: own clock, nanoseconds
     """
 
-    def __init__(self, action: str, began: int) -> None:
+    def __init__(self, action: str, began_at: int) -> None:
         self.action = action
-        self.began = began
-        self.ending: int | None = None
-        """Since when it is to end, own clock, nanoseconds."""
-        self.asking = False
-        self.asked = 0
-        """How often it was asked to once more."""
+        self.began_at = began_at
+        self.cancelled_at: int | None = None
+        """When it was first cancelled, own clock, nanoseconds; ``None``: it was not."""
+        self.is_cancelling = False
+        self.attempts = 0
+        """How often it was cancelled again."""
 
 
-class _Adrift:
-    """A goal that may go on.
+class _OrphanedGoal:
+    """A goal that its action may still execute, although it was given up.
 
-    :param until: when it is forgotten, seconds
+    :param until: when it is forgotten, seconds of the reactor's clock
     """
 
     def __init__(self, action: str, until: float) -> None:
         self.action = action
         self.until = until
-        self.asking = False
+        self.is_cancelling = False
 
 
 class ActiveGoals:
-    """Knows which actions that move the robot pursue goals of this daemon, and ends those of the one before.
+    """Tracks which actions that move the robot execute goals of this daemon, and cancels those of an earlier one.
 
-    :param everything: patterns of all actions that move the robot, for a note that can't be read
-    :param latch: where the note is kept
+    :param patterns: patterns of all actions that move the robot, used where the store can't be read
+    :param goal_canceller: cancels goals
+    :param stop_store: stores the actions with goals
     :param clock: for timers
     :param now: clock of :mod:`relay_protocol.clocks`, nanoseconds
     """
 
     def __init__(
         self,
-        everything: list[str],
+        patterns: list[str],
         guard: GuardPort,
-        sweep: GoalCanceller,
-        latch: StopStore,
+        goal_canceller: GoalCanceller,
+        stop_store: StopStore,
         clock: Any,
         now: Callable[[], int],
     ) -> None:
         self._guard = guard
-        self._sweep = sweep
-        self._latch = latch
+        self._goal_canceller = goal_canceller
+        self._store = stop_store
         self._clock = clock
         self._now = now
-        self._running: dict[str, int] = {}
-        """How many goals by action, also adrift; none where the guard is only kept able to cancel them."""
-        self.proof: Callable[[], int] = now
-        """When the latest ping that the relay has answered was sent."""
-        self.on_pursuing: Callable[[bool], None] = lambda pursuing: None
-        """Called when a goal is under way, and when none is any more."""
+        self._goal_counts: dict[str, int] = {}
+        """Number of goals by action, including orphaned ones; 0 while only the guard's client is kept."""
+        self._prepared: set[str] = set()
+        """Actions in the graph, of which the guard has clients."""
+        self.link_proven_at: Callable[[], int] = now
+        """Returns when the latest ping that the relay has answered was sent, nanoseconds of ``now``."""
+        self.on_active: Callable[[bool], None] = lambda active: None
+        """Called with true when the first goal begins, and with false when the last one has ended."""
         self.on_changed: Callable[[], None] = lambda: None
-        """Called when :attr:`pursued` is another."""
-        self._under_way: dict[GoalHandle, _UnderWay] = {}
-        self._doubted: set[GoalHandle] = set()
-        """Those that were cancelled for want of proof."""
-        self._adrift: dict[bytes, _Adrift] = {}
-        """By the goal's id, the oldest first."""
-        self._waiting: list[Deferred[list[str]]] = []
-        """Who wants to know when none is left."""
-        self._forgetting: dict[str, DelayedCall] = {}
-        self._beating: DelayedCall | None = None
-        self._log = Logger("pursuits")
-        noted = latch.goals()
-        self._left = set(everything if noted is None else noted)
-        """Actions, or patterns of them, whose goals are still to be cancelled since before this start."""
+        """Called when :attr:`active_actions` has changed."""
+        self._active: dict[GoalHandle, _ActiveGoal] = {}
+        self._cancelled_unproven: set[GoalHandle] = set()
+        """Goals cancelled because the relay did not answer."""
+        self._orphaned: dict[bytes, _OrphanedGoal] = {}
+        """Orphaned goals by id, the oldest first."""
+        self._waiters: list[Deferred[list[str]]] = []
+        """Fired when no goal is active."""
+        self._forget_timers: dict[str, DelayedCall] = {}
+        self._guard_timer: DelayedCall | None = None
+        self._log = Logger("goals")
+        stored = stop_store.load_actions()
+        self._leftover = set(patterns if stored is None else stored)
+        """Actions, or patterns of them, whose leftover goals are still to be cancelled."""
         self._refusing: set[str] = set()
-        """Those among them that have answered, but refuse."""
-        self._missed: dict[str, float] = {}
-        """Since when those that refuse are not there, seconds."""
-        self._swept: set[str] = set()
-        self._looks = LOOKS if self._left else 0
-        if self._left:
-            names = ", ".join(sorted(self._left))
-            self._log.warn("a daemon before this left goals of {names}; they are cancelled", names=names)
+        """Actions with leftover goals that refuse to cancel them."""
+        self._missing_since: dict[str, float] = {}
+        """By refusing action, since when it is missing in the graph, seconds."""
+        self._leftover_cancelled: set[str] = set()
+        self._attempts_left = LEFTOVER_ATTEMPTS if self._leftover else 0
+        if self._leftover:
+            names = ", ".join(sorted(self._leftover))
+            self._log.warn("an earlier daemon left goals of {names}; they are cancelled", names=names)
 
-    def look(self) -> None:
-        """Cancel what a daemon before this left, what is adrift, and what is to end; to be called every second."""
-        if self._adrift:
-            self._look_for_adrift()
-        self._ask_again()
-        if not self._left:
+    def retry_cancels(self) -> None:
+        """Cancel leftover, orphaned and late goals, and prepare the guard; to be called every second."""
+        present = self._goal_canceller.actions()
+        self._prepare_guard(self._goal_canceller.moving_actions)
+        if self._orphaned:
+            self._cancel_orphaned()
+        self._cancel_late_again()
+        if not self._leftover:
             return
-        self._looks = max(0, self._looks - 1)
-        there = self._sweep.actions()
-        self._miss(there)
-        for action in there:
-            if self._is_left(action):
-                self._sweep.cancel_surely(action).addCallback(self._answered, action)
-        if not self._looks and self._left != self._refusing:
-            # Others never appeared. What refuses still has goals that nobody here knows of.
-            self._left = set(self._refusing)
-            self._note()
+        self._attempts_left = max(0, self._attempts_left - 1)
+        self._give_up_missing(present)
+        for action in present:
+            if self._is_leftover(action):
+                self._goal_canceller.cancel_all_checked(action).addCallback(
+                    self._leftover_cancel_answered, action
+                )
+        if not self._attempts_left and self._leftover != self._refusing:
+            # The others never appeared. Refusing actions still have goals that this daemon does not know.
+            self._leftover = set(self._refusing)
+            self._save_actions()
+
+    def _prepare_guard(self, present: list[str]) -> None:
+        """Have the guard's clients of actions in the graph ready before a goal begins, as DDS takes time to match them.
+
+        :param present: actions that move the robot
+        """
+        found = set(present[:MAX_ACTIONS])
+        for action in found - self._prepared:
+            self._guard.add_topic(cancelling(action))
+        for action in self._prepared - found - self._goal_counts.keys():
+            self._guard.forget(cancelling(action))
+        self._prepared = found
 
     @property
-    def pursued(self) -> list[str]:
-        """The actions that pursue goals, or may do so, sorted."""
-        return sorted(action for action, goals in self._running.items() if goals)
+    def active_actions(self) -> list[str]:
+        """The actions that execute goals, or may do so, sorted."""
+        return sorted(action for action, goals in self._goal_counts.items() if goals)
 
     @property
-    def overdue(self) -> list[str]:
-        """The actions that may pursue goals which were to end a second ago or earlier, sorted."""
+    def uncancelled_actions(self) -> list[str]:
+        """The actions that may still execute goals cancelled :data:`CANCEL_AGAIN_AFTER` ago or earlier, sorted."""
         late = {each.action for each in self._late().values()}
-        return sorted(late | {each.action for each in self._adrift.values()} | self._refusing)
+        return sorted(late | {each.action for each in self._orphaned.values()} | self._refusing)
 
-    def standing(self, seconds: float) -> Deferred[list[str]]:
-        """Fires with :attr:`pursued`, when none is under way but what is adrift, or in so many seconds."""
-        if not self._under_way:
-            return succeed(self.pursued)
-        waiting: Deferred[list[str]] = Deferred(self._waiting.remove)
-        self._waiting.append(waiting)
-        return waiting.addTimeout(seconds, self._clock, lambda *_: self.pursued)
+    def goals_ended(self, seconds: float) -> Deferred[list[str]]:
+        """Fires with :attr:`active_actions` when only orphaned goals are left, or after ``seconds``."""
+        if not self._active:
+            return succeed(self.active_actions)
+        waiting: Deferred[list[str]] = Deferred(self._waiters.remove)
+        self._waiters.append(waiting)
+        return waiting.addTimeout(seconds, self._clock, lambda *_: self.active_actions)
 
     def check(self, action: str) -> None:
-        """See that a goal of an action may begin.
+        """Check that a goal of an action may begin.
 
         :param action: its full name
-        :raises Unavailable: goals of it are still being cancelled, or goals of too many are under way
+        :raises Unavailable: leftover goals of it are still being cancelled, the guard can't cancel its goals yet, or
+            too many actions have goals
         """
-        if self._is_left(action):
+        if self._is_leftover(action):
             raise Unavailable(
                 f"{action} still has goals of before the robot's daemon was started, which are being cancelled; "
                 "try again in a moment"
             )
-        if action not in self._running and len(self._running) >= MAX_ACTIONS and not self._forgetting:
+        if (
+            action not in self._goal_counts
+            and len(self._goal_counts) >= MAX_ACTIONS
+            and not self._forget_timers
+        ):
             raise Unavailable(
                 f"{MAX_ACTIONS} actions that move the robot are in use; wait until one has ended"
             )
+        if action not in self._prepared:
+            self._goal_canceller.actions()
+            self._prepare_guard(self._goal_canceller.moving_actions)
+        # An action that is not in the graph ends its goal by itself.
+        if action in self._prepared and not self._guard.ready(cancelling(action)):
+            raise Unavailable(
+                f"the robot's guard can't cancel goals of {action} yet, as it must if the daemon dies; "
+                "try again in a moment"
+            )
 
     def add(self, action: str, goal: GoalHandle) -> None:
-        """A goal has begun.
+        """Track a goal that has begun.
 
         :param action: its full name
         """
-        timer = self._forgetting.pop(action, None)
+        timer = self._forget_timers.pop(action, None)
         if timer is not None:
             timer.cancel()
-        if action not in self._running and len(self._running) >= MAX_ACTIONS:
-            self._forget(next(iter(self._forgetting)))
-        self._running[action] = self._running.get(action, 0) + 1
-        if self._running[action] == 1:
-            self._guard.topic(cancelling(action))
-            self._guard.command(cancelling(action), True, self._now())
-            self._note()
+        if action not in self._goal_counts and len(self._goal_counts) >= MAX_ACTIONS:
+            self._forget(next(iter(self._forget_timers)))
+        self._goal_counts[action] = self._goal_counts.get(action, 0) + 1
+        if self._goal_counts[action] == 1:
+            self._guard.add_topic(cancelling(action))
+            self._guard.note_command(cancelling(action), True, self._now())
+            self._save_actions()
             self.on_changed()
-        if self._beating is None:
-            self._beating = self._clock.callLater(BEAT, self._beat)
-        self._under_way[goal] = _UnderWay(action, self._now())
-        if len(self._under_way) == 1:
-            self.on_pursuing(True)
-        goal.result.addBoth(self._ended, action, goal)
+        if self._guard_timer is None:
+            self._guard_timer = self._clock.callLater(NOTIFY_GUARD_EVERY, self._notify_guard)
+        self._active[goal] = _ActiveGoal(action, self._now())
+        if len(self._active) == 1:
+            self.on_active(True)
+        goal.result.addBoth(self._goal_ended, action, goal)
 
-    def end(self, goal: GoalHandle) -> None:
-        """See that a goal ends that was just cancelled, and must not go on: nobody drives the robot by it any more."""
-        known = self._under_way.get(goal)
-        if known is not None and known.ending is None:
-            known.ending = self._now()
+    def note_cancelled(self, goal: GoalHandle) -> None:
+        """Note that a goal was cancelled and has to end; while it does not, it is cancelled again."""
+        known = self._active.get(goal)
+        if known is not None and known.cancelled_at is None:
+            known.cancelled_at = self._now()
 
-    def _late(self) -> dict[GoalHandle, _UnderWay]:
-        least = self._now() - OVERDUE
+    def _late(self) -> dict[GoalHandle, _ActiveGoal]:
+        latest = self._now() - CANCEL_AGAIN_AFTER
         return {
             goal: each
-            for goal, each in self._under_way.items()
-            if each.ending is not None and each.ending <= least
+            for goal, each in self._active.items()
+            if each.cancelled_at is not None and each.cancelled_at <= latest
         }
 
-    def _ask_again(self) -> None:
-        """Ask what was cancelled and goes on."""
+    def _cancel_late_again(self) -> None:
+        """Cancel late goals again, those with the fewest attempts first."""
         late = self._late()
         if not late:
             return
-        there = set(self._sweep.actions())
+        present = set(self._goal_canceller.actions())
         idle = [
-            (each.asked, goal, each)
+            (each.attempts, goal, each)
             for goal, each in late.items()
-            if not each.asking and each.action in there
+            if not each.is_cancelling and each.action in present
         ]
-        free = MAX_ASKING - sum(each.asking for each in late.values())
+        free = MAX_CANCELLING - sum(each.is_cancelling for each in late.values())
         for _, goal, each in sorted(idle, key=itemgetter(0))[: max(0, free)]:
-            each.asking = True
-            each.asked += 1
-            self._sweep.cancel(each.action, goal.id).addCallback(self._asked, each)
+            each.is_cancelling = True
+            each.attempts += 1
+            self._goal_canceller.cancel(each.action, goal.id).addCallback(self._late_cancel_answered, each)
 
-    def _asked(self, words: str | None, each: _UnderWay) -> None:
-        """An action was asked once more; whether it has ended the goal its result says."""
-        each.asking = False
+    def _late_cancel_answered(self, refusal: str | None, each: _ActiveGoal) -> None:
+        """Note that a further cancel request has ended; only the goal's result shows whether the goal has."""
+        each.is_cancelling = False
 
-    def _ended(self, outcome: Ended, action: str, goal: GoalHandle) -> Ended:
-        del self._under_way[goal]
-        self._doubted.discard(goal)
+    def _goal_ended(self, outcome: Ended, action: str, goal: GoalHandle) -> Ended:
+        del self._active[goal]
+        self._cancelled_unproven.discard(goal)
         if isinstance(outcome, GoalOutcome) and outcome.certain:
-            self._over(action)
+            self._count_ended(action)
         else:
-            self._drift(action, goal)
-        self._tell_standing()
+            self._orphan(action, goal)
+        self._notify_if_none()
         return outcome
 
-    def _over(self, action: str) -> None:
-        self._running[action] -= 1
-        if not self._running[action]:
-            self._guard.command(cancelling(action), False, self._now())
-            self._forgetting[action] = self._clock.callLater(KEPT, self._forget, action)
-            self._note()
+    def _count_ended(self, action: str) -> None:
+        self._goal_counts[action] -= 1
+        if not self._goal_counts[action]:
+            self._guard.note_command(cancelling(action), False, self._now())
+            self._forget_timers[action] = self._clock.callLater(GUARD_CLIENT_SECONDS, self._forget, action)
+            self._save_actions()
             self.on_changed()
 
-    def _tell_standing(self) -> None:
-        if self._under_way:
+    def _notify_if_none(self) -> None:
+        if self._active:
             return
-        self.on_pursuing(False)
-        waiting, self._waiting = self._waiting, []
+        self.on_active(False)
+        waiting, self._waiters = self._waiters, []
         for each in waiting:
-            each.callback(self.pursued)
+            each.callback(self.active_actions)
 
-    def _drift(self, action: str, goal: GoalHandle) -> None:
-        if len(self._adrift) >= MAX_ADRIFT:
-            self._lose(next(iter(self._adrift)))
-        self._adrift[goal.id] = _Adrift(action, self._clock.seconds() + ADRIFT)
+    def _orphan(self, action: str, goal: GoalHandle) -> None:
+        if len(self._orphaned) >= MAX_ORPHANED:
+            self._give_up_orphan(next(iter(self._orphaned)))
+        self._orphaned[goal.id] = _OrphanedGoal(action, self._clock.seconds() + ORPHAN_SECONDS)
         self._log.warn(
-            "a goal of {action} may go on; it is cancelled when that is there again", action=action
+            "a goal of {action} may continue; it is cancelled when the action is in the graph again",
+            action=action,
         )
 
-    def _look_for_adrift(self) -> None:
-        there = set(self._sweep.actions())
+    def _cancel_orphaned(self) -> None:
+        present = set(self._goal_canceller.actions())
         now = self._clock.seconds()
-        for id, each in list(self._adrift.items()):
+        for id, each in list(self._orphaned.items()):
             if now >= each.until:
-                self._lose(id)
-            elif each.action in there and not each.asking:
-                each.asking = True
-                self._sweep.cancel(each.action, id).addCallback(self._caught, id, each)
+                self._give_up_orphan(id)
+            elif each.action in present and not each.is_cancelling:
+                each.is_cancelling = True
+                self._goal_canceller.cancel(each.action, id).addCallback(
+                    self._orphan_cancel_answered, id, each
+                )
 
-    def _caught(self, words: str | None, id: bytes, each: _Adrift) -> None:
-        """An action was asked to cancel a goal that was adrift; only one that does not refuse ends it."""
-        each.asking = False
-        if words == "" and self._adrift.pop(id, None) is not None:
-            self._over(each.action)
+    def _orphan_cancel_answered(self, refusal: str | None, id: bytes, each: _OrphanedGoal) -> None:
+        """Handle the answer to the cancel request of an orphaned goal; only one without a refusal ends the goal."""
+        each.is_cancelling = False
+        if refusal == "" and self._orphaned.pop(id, None) is not None:
+            self._count_ended(each.action)
 
-    def _lose(self, id: bytes) -> None:
-        action = self._adrift.pop(id).action
-        self._log.warn("a goal of {action} may go on, and is looked for no longer", action=action)
-        self._over(action)
+    def _give_up_orphan(self, id: bytes) -> None:
+        action = self._orphaned.pop(id).action
+        self._log.warn("a goal of {action} may continue; it is no longer tracked", action=action)
+        self._count_ended(action)
 
     def _forget(self, action: str) -> None:
-        timer = self._forgetting.pop(action)
+        timer = self._forget_timers.pop(action)
         if timer.active():
             timer.cancel()
-        del self._running[action]
-        self._guard.forget(cancelling(action))
+        del self._goal_counts[action]
+        if action not in self._prepared:
+            self._guard.forget(cancelling(action))
 
-    def _beat(self) -> None:
-        self._beating = None
+    def _notify_guard(self) -> None:
+        self._guard_timer = None
         self._cancel_unproven()
-        running = self.pursued
-        for action in running:
-            self._guard.command(cancelling(action), True, self._now())
-        if running:
-            self._beating = self._clock.callLater(BEAT, self._beat)
+        actions = self.active_actions
+        for action in actions:
+            self._guard.note_command(cancelling(action), True, self._now())
+        if actions:
+            self._guard_timer = self._clock.callLater(NOTIFY_GUARD_EVERY, self._notify_guard)
 
     def _cancel_unproven(self) -> None:
-        least = self._now() - UNPROVEN
-        if self.proof() >= least:
+        latest = self._now() - LINK_UNPROVEN_AFTER
+        if self.link_proven_at() >= latest:
             return
-        for goal in [goal for goal, each in self._under_way.items() if each.began < least]:
-            if goal in self._doubted:
+        for goal in [goal for goal, each in self._active.items() if each.began_at < latest]:
+            if goal in self._cancelled_unproven:
                 continue
-            self._doubted.add(goal)
+            self._cancelled_unproven.add(goal)
             self._log.warn(
-                "the relay has not answered for {time:g} s: a goal is cancelled", time=UNPROVEN / 1e9
+                "the relay has not answered for {time:g} s: a goal is cancelled",
+                time=LINK_UNPROVEN_AFTER / 1e9,
             )
             try:
                 goal.cancel()
-            except Exception:  # one that fails must not keep the next from its end
+            except Exception:  # a failure of one goal must not prevent cancelling the next
                 self._log.failure("a goal could not be cancelled")
-            self.end(goal)
+            self.note_cancelled(goal)
 
-    def _is_left(self, action: str) -> bool:
-        return action not in self._swept and any(fnmatchcase(action, each) for each in self._left)
+    def _is_leftover(self, action: str) -> bool:
+        return action not in self._leftover_cancelled and any(
+            fnmatchcase(action, each) for each in self._leftover
+        )
 
-    def _answered(self, words: str | None, action: str) -> None:
-        """An action was asked to cancel its goals: ``None``, it was not heard of; else what it refused, in words."""
-        if words is None:
+    def _leftover_cancel_answered(self, refusal: str | None, action: str) -> None:
+        """Handle the answer to the cancel request of leftover goals, as of :meth:`GoalCanceller.cancel_all_checked`."""
+        if refusal is None:
             return
-        if words:
-            if self._is_left(action) and action not in self._refusing:
+        if refusal:
+            if self._is_leftover(action) and action not in self._refusing:
                 self._refusing.add(action)
-                self._left.add(action)
-                self._note()
+                self._leftover.add(action)
+                self._save_actions()
             return
         self._refusing.discard(action)
-        self._swept.add(action)
-        if action in self._left:
-            self._left.discard(action)
-            self._note()
+        self._leftover_cancelled.add(action)
+        if action in self._leftover:
+            self._leftover.discard(action)
+            self._save_actions()
 
-    def _miss(self, there: list[str]) -> None:
-        """Give up what refuses and does not come back: its goals have most likely ended with its node.
+    def _give_up_missing(self, present: list[str]) -> None:
+        """Give up refusing actions that stay missing: their goals have most likely ended with their nodes.
 
-        :param there: the actions there are now
+        :param present: the actions in the graph now
         """
         now = self._clock.seconds()
-        self._missed = {action: self._missed.get(action, now) for action in self._refusing.difference(there)}
-        lost = {action for action, since in self._missed.items() if now - since >= ADRIFT}
+        self._missing_since = {
+            action: self._missing_since.get(action, now) for action in self._refusing.difference(present)
+        }
+        lost = {action for action, since in self._missing_since.items() if now - since >= ORPHAN_SECONDS}
         if not lost:
             return
         for action in sorted(lost):
-            self._log.warn("goals of {action} may go on, and are looked for no longer", action=action)
-            self._sweep.forget(action)
+            self._log.warn("goals of {action} may continue; they are no longer tracked", action=action)
+            self._goal_canceller.forget(action)
         self._refusing -= lost
-        self._left -= lost
-        self._note()
+        self._leftover -= lost
+        self._save_actions()
 
-    def _note(self) -> None:
+    def _save_actions(self) -> None:
         try:
-            self._latch.keep_goals(sorted({*self.pursued, *self._left}))
+            self._store.store_actions(sorted({*self.active_actions, *self._leftover}))
         except Unavailable as error:
             self._log.warn("{why}", why=str(error))

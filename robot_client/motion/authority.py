@@ -1,48 +1,43 @@
-"""Who may move the robot now. Pure: sources and times go in, verdicts come out (SPEC 2.5, "Who moves the robot").
+"""Which source may move the robot now. No I/O: from sources and times to decisions (SPEC 2.5, "Control of motion").
 
-Stop is above all, then whoever suppresses a topic, then whoever holds control. Who went on commanding while he might
-not has to let go first: his hand is on the stick, and nobody expects the robot to follow it in this very moment.
+A source is a client's connection, by the number that its commands carry. A stop comes first, then a suppression of
+the topic, then control. A source that went on commanding while it was not permitted must release the controls first;
+:mod:`relay_protocol.release_rule` has that rule.
 """
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from relay_protocol import link
-from relay_protocol.limits import FACTS
-from robot_client.motion.safety import MILLI
+from relay_protocol.limits import LIST_ITEMS
+from relay_protocol.release_rule import RELEASE_NS, CommandStream, CommandStreams, StreamsBeforeLoss
+from robot_client.motion.command_age import MILLI
 
-_Key = TypeVar("_Key")
-_Value = TypeVar("_Value")
+NO_SOURCE = 0
+"""The holder while no source has control."""
 
-NOBODY = 0
-LET_GO = 500 * MILLI
-"""Silence of this length is letting go."""
-
-SETTLED = 5000 * MILLI
-"""How long after a new control link a stream may take to be heard again: its channel link has to come first."""
-
-DOUBT = 300 * MILLI
+PING_TOLERANCE = 300 * MILLI
 """How much earlier than it was a command may seem to have been sent: the relay pings clients ten times a second, and
-pings take their way (SPEC 1.5, "Clocks and deadline").
-"""
+pings take time (SPEC 2.5-55)."""
 
-GRIPS = 4096
-"""Most sources and topics whose latest commands are remembered; who was not heard for longest is forgotten first."""
+STREAMS = 4096
+"""Most sources and topics whose latest commands are remembered; the ones silent for longest are forgotten first."""
 
 
-class Verdict(enum.Enum):
-    """What becomes of a command, and why."""
+class MotionDecision(enum.Enum):
+    """Whether a command is carried out, and why not."""
 
-    ALLOWED = "it is obeyed"
-    STOPPED = "the robot is stopped until somebody resumes it"
-    SUPPRESSED = "others command this topic for a moment"
-    OVERRULED = "others suppress a topic that moves it; send it again when that is over"
-    NOT_HOLDER = "only who holds control moves the robot"
-    NOT_LET_GO = "it must let go first: say zero, or nothing for half a second"
-    OVERTAKEN = (
+    ALLOWED = "it is carried out"
+    STOPPED = "the robot is stopped until it is resumed"
+    SUPPRESSED = "other sources suppress this topic; send it again when that has ended"
+    SUPPRESSED_ELSEWHERE = (
+        "other sources suppress a topic that moves the robot; send it again when that has ended"
+    )
+    NOT_HOLDER = "only the holder of control moves the robot"
+    MUST_RELEASE = "release the controls first: send zero, or nothing for half a second"
+    STALE = (
         "it may have been sent before the robot was stopped or resumed, or control was lost; send it again"
     )
 
@@ -58,160 +53,142 @@ class Suppression(NamedTuple):
     by: str
 
 
-class ReleaseState:
-    """A source that keeps moving a topic, or would.
+class Authority:
+    """Holder, stop and suppressions of one robot.
 
-    :ivar last: when its latest command came, nanoseconds
-    :ivar innocent: ever since it began nobody has held control, which is how programs take a free robot
-    :ivar barred: it must let go first
+    :param capacity: most streams of commands that are remembered
     """
 
-    __slots__ = ("barred", "innocent", "last")
-
-    def __init__(self, last: int) -> None:
-        self.last = last
-        self.innocent = True
-        self.barred = False
-
-
-class Authority:
-    """Holder, stop and suppressions of one robot."""
-
-    def __init__(self) -> None:
-        self.holder = NOBODY
+    def __init__(self, capacity: int = STREAMS) -> None:
+        self.holder = NO_SOURCE
         self.user = ""
         self.level = ""
         self.stopped: link.Stopped | None = None
         self.suppressions: dict[str, Suppression] = {}
         self.refused = 0
-        """Commands that were not obeyed."""
-        self._grips: dict[tuple[int, str], ReleaseState] = {}
-        self._opened: set[str] = set()
-        """Topics on which the holder said zero last, since the stop."""
+        """Commands that were not carried out."""
+        self._capacity = capacity
+        self._streams: CommandStreams[tuple[int, str]] = CommandStreams(capacity)
+        self._link_loss = StreamsBeforeLoss(capacity)
+        self._zeroed: set[str] = set()
+        """Topics on which the holder's latest command since the stop was zero."""
         self._resumed: tuple[int, int] | None = None
-        """Who held control at the last resume, and when that was."""
-        self._turned: int | None = None
-        """When the robot was stopped or resumed last, or its control link lost: nothing sent before moves it."""
-        self._ceded: dict[int, int] = {}
-        """Sources that have lost control since then, and when; the latest last."""
-        self._lost = False
-        """Whether there is no control link, and was one."""
-        self._met: int | None = None
-        """When the present control link began, if there was one before."""
-        self._heard: dict[int, None] = {}
-        """Sources that have commanded since the present control link began, the latest last."""
-        self._former: dict[int, None] = {}
-        """Those that commanded by earlier ones."""
-        self._users: dict[str, None] = {}
-        """Users who held control since the present control link began, the latest last."""
-        self._former_users: dict[str, None] = {}
-        """Those who did by earlier ones: to a relay that was started anew they come under another number."""
-        self._again: dict[tuple[int, str], None] = {}
-        """Sources and topics heard soon after that."""
-        self._released: dict[tuple[str, str], None] = {}
-        """Users and topics of which they have let go since then, by whatever connection."""
+        """The holder at the last resume, and when that was."""
+        self._refused_before: int | None = None
+        """When the robot was last stopped or resumed, or its control link lost; commands sent before are refused."""
+        self._control_lost_at: dict[int, int] = {}
+        """Sources that have lost control since then, and when, nanoseconds; the latest last."""
+
+    @property
+    def link_is_lost(self) -> bool:
+        """Whether the control link was lost and is not restored yet."""
+        return self._link_loss.lost
 
     # --- judging -------------------------------------------------------------------------------------------
 
-    def judge(self, source: int, topic: str, moving: bool, now: int, sent: int) -> Verdict:
-        """What becomes of one command; what is refused is counted.
+    def decide(self, source: int, topic: str, moving: bool, now: int, earliest_sent: int) -> MotionDecision:
+        """Decide on one command. Call it once for each: it records what its source commands, and counts refusals.
 
         :param topic: as the platform resolved it
         :param moving: whether it is anything but zero
         :param now: own clock, nanoseconds
-        :param sent: before when it can't have been sent, own clock, nanoseconds; no later than ``now``
+        :param earliest_sent: the earliest time it can have been sent, own clock, nanoseconds; no later than ``now``
         """
-        verdict = self._rank(source, topic, now)
-        _note(self._heard, source, None)
+        decision = self._decide_by_source(source, topic, now)
+        self._link_loss.note_command(source)
         if not moving:
-            self._grips.pop((source, topic), None)
+            self._streams.zero((source, topic))
             if source == self.holder:
-                _note(self._released, (self.user, topic), None)
-                if len(self._opened) < GRIPS:
-                    self._opened.add(topic)
-        elif self._barred(source, topic, verdict, now, sent) and verdict is Verdict.ALLOWED:
-            verdict = Verdict.NOT_LET_GO
-        elif self._overtaken(source, sent) and verdict is Verdict.ALLOWED:
-            verdict = Verdict.OVERTAKEN
-        if self._just_met(now):
-            _note(self._again, (source, topic), None)
-        if verdict is not Verdict.ALLOWED:
-            self.refused += 1
-        return verdict
+                self._link_loss.released(self.user, topic)
+                if len(self._zeroed) < self._capacity:
+                    self._zeroed.add(topic)
+        else:
+            must_release = self._record_movement(source, topic, decision, now, earliest_sent)
+            if decision is MotionDecision.ALLOWED and must_release:
+                decision = MotionDecision.MUST_RELEASE
+            elif decision is MotionDecision.ALLOWED and self._is_stale(source, earliest_sent):
+                decision = MotionDecision.STALE
+        self._link_loss.decided_on(source, topic, now)
+        return self._count_refused(decision)
 
-    def judge_request(self, source: int, now: int, sent: int) -> Verdict:
-        """What becomes of a call or a goal that moves the robot; what is refused is counted.
+    def decide_request(self, source: int, now: int, earliest_sent: int) -> MotionDecision:
+        """Decide on a call or a goal that moves the robot; refused ones are counted.
 
-        What a goal makes of itself, by publishers of the robot's own, no suppression holds back: so none begins while
-        others suppress any topic.
+        A suppression does not affect commands that the robot's own nodes publish for a goal. So no goal begins while
+        other sources suppress any topic.
 
-        :param now: as of :meth:`judge`, like ``sent``
+        :param now: as of :meth:`decide`, like ``earliest_sent``
         """
-        verdict = Verdict.ALLOWED
+        decision = MotionDecision.ALLOWED
         if self.stopped is not None:
-            verdict = Verdict.STOPPED
-        elif source == NOBODY or source != self.holder:
-            verdict = Verdict.NOT_HOLDER
-        elif self._overruled(source, now):
-            verdict = Verdict.OVERRULED
-        elif self._overtaken(source, sent):
-            verdict = Verdict.OVERTAKEN
-        if verdict is not Verdict.ALLOWED:
-            self.refused += 1
-        return verdict
+            decision = MotionDecision.STOPPED
+        elif source == NO_SOURCE or source != self.holder:
+            decision = MotionDecision.NOT_HOLDER
+        elif self._is_suppressed_anywhere(source, now):
+            decision = MotionDecision.SUPPRESSED_ELSEWHERE
+        elif self._is_stale(source, earliest_sent):
+            decision = MotionDecision.STALE
+        return self._count_refused(decision)
 
-    def commands(self, source: int, topic: str, now: int) -> bool:
-        """Whether this source is the one to move a topic now."""
-        return self._rank(source, topic, now) is Verdict.ALLOWED
+    def _count_refused(self, decision: MotionDecision) -> MotionDecision:
+        if decision is not MotionDecision.ALLOWED:
+            self.refused += 1
+        return decision
+
+    def may_command(self, source: int, topic: str, now: int) -> bool:
+        """Whether this source may move a topic now."""
+        return self._decide_by_source(source, topic, now) is MotionDecision.ALLOWED
 
     def level_of(self, source: int) -> str:
-        """The level of who holds control; of others, such as who suppresses a topic, nobody told us: empty."""
+        """The level of the holder of control; empty for other sources, whose level is not known here."""
         return self.level if source == self.holder else ""
 
     # --- changes -------------------------------------------------------------------------------------------
 
-    def hold(self, holder: int, user: str, level: str, now: int) -> bool:
-        """Give control to a source; whether it had another before."""
+    def grant_control(self, holder: int, user: str, level: str, now: int) -> bool:
+        """Give control to a source; return whether the holder has changed."""
         self.user, self.level = user, level
         if holder == self.holder:
             return False
-        self._drop_open(now)
-        met = self._just_met(now)
-        for (source, topic), grip in self._grips.items():
-            if source == holder:
-                grip.barred = grip.barred or not grip.innocent or (met and self._returned(user, topic))
-        self._opened.clear()
-        if holder != NOBODY and user:
-            _note(self._users, user, None)
-        if self.holder != NOBODY:
-            _note(self._ceded, self.holder, now)
+        self._forget_released(now)
+        restored = self._link_loss.restored_recently(now)
+
+        def continues(key: tuple[int, str], stream: CommandStream) -> bool:
+            source, topic = key
+            contended = not stream.never_contended or (restored and self._link_loss.held_on(user, topic))
+            return source == holder and contended
+
+        self._streams.require_release(continues)
+        self._zeroed.clear()
+        if holder != NO_SOURCE and user:
+            self._link_loss.controlled_by(user)
+        if self.holder != NO_SOURCE:
+            self._note_control_lost(self.holder, now)
         self.holder = holder
         return True
 
     def stop(self, stopped: link.Stopped, now: int) -> None:
-        """Let nothing move until :meth:`resume`; who stopped it first stays on record."""
-        self._turn(now)
+        """Refuse all motion until :meth:`resume`; a further stop does not replace the first."""
+        self._refuse_all_sent_before(now)
         if self.stopped is None:
-            self._drop_open(now)
-            for grip in self._grips.values():
-                grip.barred = True
-            self._opened.clear()
+            self._forget_released(now)
+            self._streams.all_must_release()
+            self._zeroed.clear()
             self.stopped = stopped
 
     def resume(self, now: int) -> None:
-        """Let move again who has let go, or will."""
+        """End the stop; streams move the robot again once they have been released."""
         if self.stopped is None:
             return
         self.stopped = None
-        self._turn(now)
+        self._refuse_all_sent_before(now)
         self._resumed = (self.holder, now)
-        for grip in self._grips.values():
-            # What a source said while the robot was stopped need not have come as far as here.
-            grip.last = now
+        # Commands that were sent during the stop need not have arrived here.
+        self._streams.restart_silence(now)
 
     def suppress(self, topic: str, suppression: Suppression) -> bool:
-        """Give a topic to some sources for a time; whether there was room for it."""
-        if topic not in self.suppressions and len(self.suppressions) >= FACTS:
+        """Give a topic to some sources for a time; return false where too many are suppressed already."""
+        if topic not in self.suppressions and len(self.suppressions) >= LIST_ITEMS:
             return False
         self.suppressions[topic] = suppression
         return True
@@ -220,138 +197,92 @@ class Authority:
         """Give a topic back to the holder."""
         self.suppressions.pop(topic, None)
 
-    def forget(self, now: int) -> None:
-        """The relay is gone; a stop stays, and who commanded just now has to let go first when it is back."""
-        self.holder, self.user, self.level = NOBODY, "", ""
+    def link_lost(self, now: int) -> None:
+        """End control and suppressions, as the control link has ended; a stop stays, and streams must be released."""
+        self.holder, self.user, self.level = NO_SOURCE, "", ""
         self.suppressions.clear()
-        if not self._lost:
-            self._turn(now)
-            self._drop_open(now)
-        for grip in self._grips.values():
-            grip.barred = True
-        self._opened.clear()
-        self._resumed = self._met = None
-        for source in self._heard:
-            _note(self._former, source, None)
-        self._heard.clear()
-        for user in self._users:
-            _note(self._former_users, user, None)
-        self._users.clear()
-        self._lost = True
+        if not self._link_loss.lost:
+            self._refuse_all_sent_before(now)
+            self._forget_released(now)
+        self._streams.all_must_release()
+        self._zeroed.clear()
+        self._resumed = None
+        self._link_loss.link_lost()
 
-    def meet(self, now: int) -> None:
-        """The relay is there, again perhaps: nobody heard what was said meanwhile, so silence counts from now on."""
-        if not self._lost:
-            return
-        self._lost = False
-        self._met = now
-        self._again.clear()
-        self._released.clear()
-        for grip in self._grips.values():
-            grip.last = now
+    def link_restored(self, now: int) -> None:
+        """Count silence from now on, as nothing could arrive before the control link was established."""
+        if self._link_loss.lost:
+            self._link_loss.link_restored(now)
+            self._streams.restart_silence(now)
 
-    # --- ranks and grips -----------------------------------------------------------------------------------
+    # --- rank, age and release -----------------------------------------------------------------------------
 
-    def _rank(self, source: int, topic: str, now: int) -> Verdict:
+    def _decide_by_source(self, source: int, topic: str, now: int) -> MotionDecision:
         if self.stopped is not None:
-            return Verdict.STOPPED
+            return MotionDecision.STOPPED
         suppression = self.suppressions.get(topic)
         if suppression is not None and now < suppression.until:
-            return Verdict.ALLOWED if source in suppression.sources else Verdict.SUPPRESSED
-        held = source == self.holder and source != NOBODY
-        return Verdict.ALLOWED if held else Verdict.NOT_HOLDER
+            return MotionDecision.ALLOWED if source in suppression.sources else MotionDecision.SUPPRESSED
+        held = source == self.holder and source != NO_SOURCE
+        return MotionDecision.ALLOWED if held else MotionDecision.NOT_HOLDER
 
-    def _overruled(self, source: int, now: int) -> bool:
-        """Whether any topic is suppressed by others."""
+    def _is_suppressed_anywhere(self, source: int, now: int) -> bool:
         return any(now < each.until and source not in each.sources for each in self.suppressions.values())
 
-    def _turn(self, now: int) -> None:
-        """What can have been sent before this moves nothing any more, whoever sent it."""
-        self._turned = now
-        self._ceded.clear()
+    def _refuse_all_sent_before(self, now: int) -> None:
+        self._refused_before = now
+        self._control_lost_at.clear()
 
-    def _overtaken(self, source: int, sent: int) -> bool:
-        """Whether what moves the robot can have been sent before it was stopped or resumed, or lost its link; or while
-        its source held control another time.
+    def _note_control_lost(self, source: int, now: int) -> None:
+        self._control_lost_at.pop(source, None)
+        self._control_lost_at[source] = now
+        if len(self._control_lost_at) > self._capacity:
+            del self._control_lost_at[next(iter(self._control_lost_at))]
+
+    def _is_stale(self, source: int, earliest_sent: int) -> bool:
+        """Whether it can have been sent before the last stop, resume or loss of the link, or while its source had
+        control another time.
         """
-        if self._turned is not None and sent < self._turned:
+        if self._refused_before is not None and earliest_sent < self._refused_before:
             return True
-        return sent < self._ceded.get(source, sent)
+        return earliest_sent < self._control_lost_at.get(source, earliest_sent)
 
-    def _barred(self, source: int, topic: str, verdict: Verdict, now: int, sent: int) -> bool:
-        """Take note of a command to move; whether its source must let go first.
+    def _record_movement(
+        self, source: int, topic: str, decision: MotionDecision, now: int, earliest_sent: int
+    ) -> bool:
+        """Record a command that moves, whether it is carried out or not; return whether its stream must be released.
 
-        Silence is what lies between the last that came and the earliest moment at which this one can have been sent:
-        a link that stalls makes none.
+        :param decision: by rank alone
         """
-        grip = self._grips.get((source, topic))
-        if grip is None or (self.stopped is None and sent - grip.last >= LET_GO):
-            if grip is not None and source == self.holder:
-                _note(self._released, (self.user, topic), None)
-            grip = self._take(source, topic, now)
-            grip.barred = self._holds_on(source, topic, now, sent)
-        else:
-            self._grips[source, topic] = self._grips.pop((source, topic))
-        grip.last = now
-        # Of one that only seems a little too old nobody knows; it is not obeyed, but the next may be.
-        held = verdict is Verdict.STOPPED or self._overtaken(source, sent + DOUBT)
-        grip.barred = grip.barred or held
-        grip.innocent = grip.innocent and verdict is Verdict.NOT_HOLDER and self.holder == NOBODY
+        key = source, topic
+        known = key in self._streams
+        stream = self._streams.note_command(key, now, earliest_sent, silence_releases=self.stopped is None)
+        if stream.began:
+            if known and source == self.holder:
+                self._link_loss.released(self.user, topic)
+            stream.must_release = self._continues(source, topic, now, earliest_sent)
+        # A command that only seems a little too old is refused, but the next one need not be.
+        refused = decision is MotionDecision.STOPPED or self._is_stale(source, earliest_sent + PING_TOLERANCE)
+        stream.must_release = stream.must_release or refused
+        uncontended = decision is MotionDecision.NOT_HOLDER and self.holder == NO_SOURCE
+        stream.never_contended = stream.never_contended and uncontended
         if source == self.holder:
-            self._opened.discard(topic)
-        return grip.barred
+            self._zeroed.discard(topic)
+        return stream.must_release
 
-    def _holds_on(self, source: int, topic: str, now: int, sent: int) -> bool:
-        """Whether a command to move may be the going on of one that nobody heard.
+    def _continues(self, source: int, topic: str, now: int, earliest_sent: int) -> bool:
+        """Whether the first command of a stream may continue a stream whose earlier commands have not arrived.
 
-        It is the first since the control link began anew, and comes soon, from who commanded before that, be it by
-        another connection; or it comes right after the resume, from who held control then and did not say zero.
+        It comes soon after the link was restored, from a source or user that commanded before; or it comes right after
+        the resume, from the holder of that moment, whose latest command was not zero.
         """
-        if self._just_met(now) and self._was_there(source, topic):
+        holder_user = self.user if source == self.holder else None
+        if self._link_loss.continues(source, topic, holder_user, now):
             return True
         if self._resumed is None:
             return False
         holder, at = self._resumed
-        return source == holder != NOBODY and sent - at < LET_GO and topic not in self._opened
+        return source == holder != NO_SOURCE and earliest_sent - at < RELEASE_NS and topic not in self._zeroed
 
-    def _was_there(self, source: int, topic: str) -> bool:
-        """Whether it is the first from a source that commanded, or whose user held control, by an earlier link."""
-        if (source, topic) in self._again:
-            return False
-        return source in self._former or (source == self.holder and self._returned(self.user, topic))
-
-    def _returned(self, user: str, topic: str) -> bool:
-        """Whether a user held control by an earlier control link and has not let go of the topic since."""
-        return user in self._former_users and (user, topic) not in self._released
-
-    def _just_met(self, now: int) -> bool:
-        return self._met is not None and now - self._met < SETTLED
-
-    def _take(self, source: int, topic: str, now: int) -> ReleaseState:
-        if len(self._grips) >= GRIPS:
-            self._drop_open(now)
-        if len(self._grips) >= GRIPS:
-            self._drop([next(iter(self._grips))])
-        grip = self._grips[source, topic] = ReleaseState(now)
-        return grip
-
-    def _drop_open(self, now: int) -> None:
-        """Forget who has let go."""
-        barred = self.stopped is not None
-        self._drop(
-            key
-            for key, grip in self._grips.items()
-            if now - grip.last >= LET_GO and not (barred and grip.barred)
-        )
-
-    def _drop(self, keys: Iterable[tuple[int, str]]) -> None:
-        for key in list(keys):
-            del self._grips[key]
-
-
-def _note(known: dict[_Key, _Value], key: _Key, value: _Value) -> None:
-    """Remember it as the latest of at most :data:`GRIPS`."""
-    known.pop(key, None)
-    known[key] = value
-    if len(known) > GRIPS:
-        del known[next(iter(known))]
+    def _forget_released(self, now: int) -> None:
+        self._streams.forget_released(now, keep_refused=self.stopped is not None)

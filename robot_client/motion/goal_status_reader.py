@@ -1,6 +1,7 @@
-"""Which goals actions pursue, as they publish it themselves.
+"""Which goals actions execute, by their status topics.
 
-What they answer to a request to cancel all says nothing of those they refuse, nor of one they accept a moment later.
+The response to a request to cancel all goals shows neither goals that the action refuses to cancel, nor one that it
+accepts a moment later.
 """
 
 from __future__ import annotations
@@ -17,23 +18,23 @@ from robot_client.twisted_types import DelayedCall
 STATUS = "/_action/status"
 STATUS_TYPE = "action_msgs/msg/GoalStatusArray"
 
-AFTER = 0.1
-"""Seconds an action has to publish what an answer of its has changed; also, a stop has more urgent things to do."""
+READ_AFTER = 0.1
+"""Seconds from an action's answer until its status is read: it has to publish first, and a stop has urgent work."""
 
-SETTLED = 0.5
-"""Seconds that are waited for a goal which was on its way to an action when that was asked to cancel all."""
+NEW_GOAL_SECONDS = 0.5
+"""Seconds to wait for a goal that was being sent while the action was asked to cancel all goals."""
 
-WITHIN = 1.0
-"""Seconds a publisher has to be found, and to send its latest word: one that never had a goal has none."""
+STATUS_SECONDS = 1.0
+"""Seconds to discover the publisher and receive its latest status; an action that never had a goal sends none."""
 
 _QOS = link.QoS(reliability="reliable", durability="transient_local", history="keep_last", depth=1)
 
-_GOING = frozenset((1, 2))
-"""Accepted and executing; a goal that is being cancelled (3) is on its way to its end (action_msgs/msg/GoalStatus)."""
+_ACTIVE = frozenset((1, 2))
+"""Accepted and executing (action_msgs/msg/GoalStatus); a goal that is being cancelled (3) is about to end."""
 
 
 class GoalStatusReader:
-    """Listens for a moment to what actions publish.
+    """Subscribes to the status topics of actions for a short time.
 
     :param clock: for timers
     """
@@ -41,71 +42,69 @@ class GoalStatusReader:
     def __init__(self, platform: Platform, clock: Any) -> None:
         self._platform = platform
         self._clock = clock
-        self._log = Logger("statuses")
+        self._log = Logger("goals")
 
-    def going(self, action: str) -> Deferred[frozenset[bytes]]:
-        """Find out which goals an action has that nobody has cancelled.
+    def active_goals(self, action: str) -> Deferred[frozenset[bytes]]:
+        """Read which goals an action has that are not cancelled.
 
-        :return: fires with their ids as soon as there are any, else after :data:`SETTLED`, and where nothing is heard
-            after :data:`AFTER` and :data:`WITHIN`; empty where that can't be found out
+        :return: fires with their ids as soon as there are any, else after :data:`NEW_GOAL_SECONDS`; without any status,
+            after :data:`READ_AFTER` plus :data:`STATUS_SECONDS`. Empty also where the status can't be read
         """
-        settled = self._clock.seconds() + SETTLED
+        until = self._clock.seconds() + NEW_GOAL_SECONDS
         after: Deferred[None] = Deferred(lambda _: timer.cancel())
-        timer = self._clock.callLater(AFTER, after.callback, None)
-        return after.addCallback(lambda _: self._listen(action, settled))
+        timer = self._clock.callLater(READ_AFTER, after.callback, None)
+        return after.addCallback(lambda _: self._subscribe(action, until))
 
-    def _listen(self, action: str, settled: float) -> Deferred[frozenset[bytes]]:
+    def _subscribe(self, action: str, until: float) -> Deferred[frozenset[bytes]]:
         found: Deferred[frozenset[bytes]] = Deferred()
-        until: list[DelayedCall] = []
+        timers: list[DelayedCall] = []
 
-        def hear(body: bytes) -> None:
+        def receive(body: bytes) -> None:
             if found.called:
                 return
-            left = settled - self._clock.seconds()
-            ids = going(body)
+            left = until - self._clock.seconds()
+            ids = active_goals(body)
             if ids or left <= 0:
                 found.callback(ids)
-            elif not until:
-                until.append(self._clock.callLater(left, found.callback, frozenset()))
+            elif not timers:
+                timers.append(self._clock.callLater(left, found.callback, frozenset()))
 
         def leave(result: Any) -> Any:
-            for timer in until:
+            for timer in timers:
                 if timer.active():
                     timer.cancel()
-            # Not from within its own sample.
-            self._clock.callLater(0, source.close)
+            # Deferred, as this may run inside the callback of its own sample.
+            self._clock.callLater(0, subscription.close)
             return result
 
         try:
-            source: SubscriptionHandle = self._platform.subscribe(
-                action + STATUS, STATUS_TYPE, _QOS, hear, lambda: None
+            subscription: SubscriptionHandle = self._platform.subscribe(
+                action + STATUS, STATUS_TYPE, _QOS, receive, lambda: None
             )
-        except Exception:  # the rest of the stop must not hang on it
+        except Exception:  # the other parts of a stop must not depend on it
             self._log.failure("the goals of {action} can't be listened to", action=action)
             return succeed(frozenset())
-        found.addTimeout(WITHIN, self._clock, onTimeoutCancel=lambda *_: frozenset())
+        found.addTimeout(STATUS_SECONDS, self._clock, onTimeoutCancel=lambda *_: frozenset())
         return found.addBoth(leave)
 
 
-def going(body: bytes) -> frozenset[bytes]:
-    """The goals of a status array that are neither at their end nor being cancelled.
+def active_goals(body: bytes) -> frozenset[bytes]:
+    """The goals of a status array that have neither ended nor are being cancelled.
 
-    :param body: CDR; what is cut short tells of no more than it holds
+    :param body: action_msgs/msg/GoalStatusArray in CDR; of a truncated one, only complete entries count
     :return: their ids, 16 bytes each
     """
     if len(body) < 8:
         return frozenset()
     count = int.from_bytes(body[4:8], "little" if body[1] & 1 else "big")
-    at = 8
+    offset = 8
     ids = set()
     for _ in range(count):
-        id = body[at : at + 16]
-        at = (
-            at + 16 + 3
-        ) // 4 * 4 + 8  # the id, then the time of the goal, which begins at a multiple of four
-        if at >= len(body):
+        id = body[offset : offset + 16]
+        offset = (offset + 16 + 3) // 4 * 4 + 8  # the id, then the stamp of the goal, aligned to 4 bytes
+        if offset >= len(body):
             break
-        if body[at] in _GOING:
+        if body[offset] in _ACTIVE:
             ids.add(id)
-        at += 1
+        offset += 1
     return frozenset(ids)

@@ -1,4 +1,4 @@
-"""Who is told of every motion command beside the robot itself."""
+"""The interface of the guard to motion control."""
 
 from __future__ import annotations
 
@@ -8,42 +8,46 @@ from robot_client.motion.typed_topic import TypedTopic
 
 
 class GuardPort(Protocol):
-    """Who is told of every motion command, to act when the daemon can't.
+    """Is notified of every motion command (its topic, whether it moves, when), to stop the robot when the daemon can't.
 
-    And of goals, as of commands: :func:`robot_client.motion.guard_protocol.cancelling` says by what name.
+    Goals are passed like commands, under the name that :func:`robot_client.motion.guard_protocol.cancelling` gives.
     """
 
-    def topic(self, on: TypedTopic) -> None:
-        """Commands may come on this topic."""
+    def add_topic(self, topic: TypedTopic) -> None:
+        """Announce that commands may come on this topic."""
 
-    def forget(self, on: TypedTopic) -> None:
-        """No more commands will come on this topic."""
+    def forget(self, topic: TypedTopic) -> None:
+        """Announce that no more commands will come on this topic."""
 
-    def shape(self, on: TypedTopic, rest: bytes) -> None:
-        """What commands on this topic look like from now on when they are zero, see ``Platform.resting``."""
+    def set_zero_template(self, topic: TypedTopic, zero_template: bytes) -> None:
+        """Set the zero template of the next commands on this topic, see ``Platform.zero_template``."""
 
-    def command(self, on: TypedTopic, moving: bool, at: int) -> None:
-        """A command went out; ``at`` is the clock in nanoseconds."""
+    def note_command(self, topic: TypedTopic, moving: bool, at: int) -> None:
+        """Note that a command is about to move this topic, or that zero was published.
 
-    def ready(self, on: TypedTopic) -> bool:
-        """Whether it could stop this topic now."""
+        :param moving: whether it was other than zero
+        :param at: clock of :mod:`relay_protocol.clocks`, nanoseconds
+        """
+
+    def ready(self, topic: TypedTopic) -> bool:
+        """Whether the guard could stop this topic now."""
 
 
 class NoGuard:
-    """Nobody is told, by choice: motion does not wait for a guard."""
+    """Used where the settings turn the guard off: motion does not wait for one."""
 
-    def topic(self, on: TypedTopic) -> None:
-        """Pass over."""
+    def add_topic(self, topic: TypedTopic) -> None:
+        """Do nothing."""
 
-    def forget(self, on: TypedTopic) -> None:
-        """Pass over."""
+    def forget(self, topic: TypedTopic) -> None:
+        """Do nothing."""
 
-    def shape(self, on: TypedTopic, rest: bytes) -> None:
-        """Pass over."""
+    def set_zero_template(self, topic: TypedTopic, zero_template: bytes) -> None:
+        """Do nothing."""
 
-    def command(self, on: TypedTopic, moving: bool, at: int) -> None:
-        """Pass over."""
+    def note_command(self, topic: TypedTopic, moving: bool, at: int) -> None:
+        """Do nothing."""
 
-    def ready(self, on: TypedTopic) -> bool:
-        """Nothing to wait for."""
+    def ready(self, topic: TypedTopic) -> bool:
+        """Return true: there is nothing to wait for."""
         return True

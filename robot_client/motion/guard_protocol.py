@@ -1,4 +1,4 @@
-"""What the daemon and its guard tell each other: one JSON array per line on two pipes."""
+"""The messages between the daemon and its guard: one JSON array per line on two pipes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ CANCEL = "/_action/cancel_goal"
 CANCEL_TYPE = "action_msgs/srv/CancelGoal"
 
 GOALS_WITHIN_MS = 2000
-"""How long a daemon may say nothing of goals that move the robot: a stall that a driver hardly notices must not end
-what was to go on for an hour."""
+"""How long the daemon may be silent about goals that move the robot, milliseconds. Longer than for commands: a short
+stall must not cancel a goal that may take an hour."""
 
 
 def cancelling(action: str) -> TypedTopic:
-    """What the guard knows an action by: its zero is the request to cancel all goals."""
+    """The name under which the guard knows an action; publishing its zero means requesting to cancel all goals."""
     return TypedTopic(action + CANCEL, CANCEL_TYPE)
 
 
@@ -24,13 +24,13 @@ class _OfTopic(msgspec.Struct, array_like=True, frozen=True):
     type: str
 
     @property
-    def on(self) -> TypedTopic:
-        """What it is about."""
+    def typed_topic(self) -> TypedTopic:
+        """Name and type together."""
         return TypedTopic(self.topic, self.type)
 
 
 class GuardedTopic(_OfTopic, array_like=True, tag_field="line", tag="topic", frozen=True):
-    """Commands may come on this topic; have a publisher ready. Or goals of this action, see :func:`cancelling`.
+    """Commands may come on this topic, or goals of this action (:func:`cancelling`): create a publisher or client.
 
     :ivar within_ms: time to stop of this topic alone, milliseconds; 0: that of the guard
     """
@@ -38,40 +38,44 @@ class GuardedTopic(_OfTopic, array_like=True, tag_field="line", tag="topic", fro
     within_ms: int = 0
 
 
-class ZeroShape(_OfTopic, array_like=True, tag_field="line", tag="shape", frozen=True):
-    """What the next commands on this topic look like when they are zero, without a stamp; see ``Platform.resting``."""
+class ZeroTemplate(_OfTopic, array_like=True, tag_field="line", tag="zero_template", frozen=True):
+    """Zero template of the next commands on this topic, without a stamp; see ``Platform.zero_template``."""
 
-    rest: bytes
+    zero_template: bytes
 
 
 class Forget(_OfTopic, array_like=True, tag_field="line", tag="forget", frozen=True):
-    """No more commands will come on this topic; take the publisher away once the robot stands."""
+    """No more commands will come on this topic; remove the publisher once the topic is stopped."""
 
 
 class GuardedCommand(_OfTopic, array_like=True, tag_field="line", tag="command", frozen=True):
-    """A command went out. ``at`` is the clock of :mod:`relay_protocol.clocks`, nanoseconds."""
+    """A command is about to move a topic, or zero was published.
+
+    :ivar moving: whether it was other than zero
+    :ivar at: clock of :mod:`relay_protocol.clocks`, nanoseconds
+    """
 
     moving: bool
     at: int
 
 
 class Probe(msgspec.Struct, array_like=True, tag_field="line", tag="probe", frozen=True):
-    """Answer with a line."""
+    """Requests :class:`GuardAlive`."""
 
 
-class Leave(msgspec.Struct, array_like=True, tag_field="line", tag="leave", frozen=True):
-    """The daemon ends in order; stop what it could not, and go."""
+class ShutDown(msgspec.Struct, array_like=True, tag_field="line", tag="shut_down", frozen=True):
+    """The daemon shuts down; stop the topics that still move, then exit."""
 
 
 class GuardAlive(msgspec.Struct, array_like=True, tag_field="line", tag="alive", frozen=True):
-    """The guard's answer to a probe, and its first word."""
+    """The guard's answer to a probe, and its first line."""
 
 
 class TopicReady(_OfTopic, array_like=True, tag_field="line", tag="ready", frozen=True):
-    """The guard's publisher has found who listens to this topic: from now on it could stop it."""
+    """The guard's publisher has matched a subscriber: from now on the guard can stop this topic."""
 
 
-Line = GuardedTopic | ZeroShape | Forget | GuardedCommand | Probe | Leave
+Line = GuardedTopic | ZeroTemplate | Forget | GuardedCommand | Probe | ShutDown
 Answer = GuardAlive | TopicReady
 
 decoder: msgspec.json.Decoder[Line] = msgspec.json.Decoder(Line)
@@ -80,5 +84,5 @@ _encoder = msgspec.json.Encoder()
 
 
 def encode(line: Line | Answer) -> bytes:
-    """A line with its end."""
+    """Encode a line, with its newline."""
     return _encoder.encode(line) + b"\n"

@@ -1,4 +1,4 @@
-"""The daemon's side of its guard: start it, feed it, see that it lives, start it again."""
+"""The daemon's side of its guard: starts it, passes commands to it, probes it and restarts it."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import msgspec
 from twisted.internet.defer import Deferred, succeed
 from twisted.logger import Logger
 
-from robot_client.alerts import MODULE, OnAlert, nobody
-from robot_client.child import Child
+from robot_client.alerts import MODULE, OnAlert, ignore_alert
+from robot_client.child_process import ChildProcess
 from robot_client.motion.guard_protocol import (
     CANCEL_TYPE,
     GOALS_WITHIN_MS,
     Forget,
     GuardedCommand,
     GuardedTopic,
-    Leave,
     Line,
     Probe,
+    ShutDown,
     TopicReady,
-    ZeroShape,
+    ZeroTemplate,
     answer_decoder,
     encode,
 )
@@ -30,25 +30,30 @@ from robot_client.twisted_types import DelayedCall
 
 PROBE_EVERY = 5.0
 PROBE_MOVING = 1.0
-"""Seconds between probes while nothing moves, and while something does."""
+"""Seconds between probes while nothing moves (:data:`PROBE_EVERY`), and while something does."""
 
-DOUBTFUL = 2.0
+DOUBTFUL_AFTER = 2.0
 """Seconds a probe may wait for its answer before the guard no longer counts as able to stop anything."""
 
-SILENT = 20.0
-"""Seconds without an answer after which a guard is taken for frozen; its start may take some."""
+FROZEN_AFTER = 20.0
+"""Seconds without an answer after which the guard counts as frozen; they include the time it takes to start."""
 
-RESTART = (1.0, 30.0)
-LEAVE = 2.0
+RESTART_PAUSES = (1.0, 30.0)
+"""Least and greatest seconds before a restart; each failure doubles the pause."""
+
+EXIT_SECONDS = 2.0
+"""Seconds the guard may take to exit when the daemon shuts down; then it is killed."""
 
 
 class GuardSupervisor:
-    """Feeds a guard that is always there; a :class:`~robot_client.motion.guard_port.GuardPort`.
+    """Keeps a guard process running and passes commands to it.
+
+    Implements :class:`~robot_client.motion.guard_port.GuardPort`.
 
     :param reactor: for processes and timers
-    :param node: name of the guard's node; those of later guards begin with it
+    :param node: name of the first guard's node; after a restart a number is appended
     :param within_ms: time to stop, milliseconds
-    :param sim_time: whether the robot's time is what ``/clock`` says
+    :param sim_time: whether the robot's time comes from ``/clock``
     :param topics: times to stop of single topics, milliseconds
     """
 
@@ -60,146 +65,148 @@ class GuardSupervisor:
         sim_time: bool = False,
         topics: Mapping[str, int] | None = None,
     ) -> None:
-        self.on_alert: OnAlert = nobody
+        self.on_alert: OnAlert = ignore_alert
         self._reactor = reactor
         self._node = node
         self._within_ms = str(within_ms)
         self._sim_time = sim_time
-        self._within = topics or {}
+        self._within_by_topic = topics or {}
         self._started = 0
-        self._process: Child | None = None
+        self._process: ChildProcess | None = None
         self._topics: dict[TypedTopic, GuardedTopic] = {}
-        self._shapes: dict[TypedTopic, ZeroShape] = {}
+        self._zero_templates: dict[TypedTopic, ZeroTemplate] = {}
         self._commands: dict[TypedTopic, GuardedCommand] = {}
         self._ready: set[TypedTopic] = set()
-        self._asked: float | None = None
+        self._probed_at: float | None = None
         self._failures = 0
         self._timer: DelayedCall | None = None
-        self._left: Deferred[None] | None = None
+        self._exited: Deferred[None] | None = None
         self._log = Logger("guard")
 
     def start(self) -> None:
-        """Start a guard and tell it all that matters now."""
+        """Start a guard and send it all topics, zero templates and last commands."""
         self._timer = None
-        self._process = process = Child(self)
+        self._process = process = ChildProcess(self)
         try:
             process.start(self._reactor, self._arguments())
         except OSError as error:
-            self.lost(f"it can't be started: {error.strerror}")
+            self.on_exit(f"it can't be started: {error.strerror}")
             return
-        lines: list[Line] = [*self._topics.values(), *self._shapes.values(), *self._commands.values()]
+        lines: list[Line] = [*self._topics.values(), *self._zero_templates.values(), *self._commands.values()]
         for line in lines:
-            process.tell(encode(line))
-        self._heard = self._reactor.seconds()
-        self._timer = self._reactor.callLater(self._pause, self._probe)
+            process.send(encode(line))
+        self._answered_at = self._reactor.seconds()
+        self._timer = self._reactor.callLater(self._probe_interval, self._probe)
 
     def stop(self) -> Deferred[None]:
-        """Let the guard leave; fires when it has."""
+        """Shut the guard down; fires when its process has ended."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         if self._process is None:
             return succeed(None)
-        self._left = Deferred()
-        self._process.tell(encode(Leave()))
-        self._process.leave()
-        self._timer = self._reactor.callLater(LEAVE, self._process.kill)
-        return self._left
+        self._exited = Deferred()
+        self._process.send(encode(ShutDown()))
+        self._process.close()
+        self._timer = self._reactor.callLater(EXIT_SECONDS, self._process.kill)
+        return self._exited
 
     @property
     def pid(self) -> int | None:
-        """Process of the guard that lives now."""
+        """Process id of the running guard."""
         return self._process.transport.pid if self._process else None
 
-    def topic(self, on: TypedTopic) -> None:
-        """Commands may come on this topic."""
-        if on not in self._topics:
-            within = GOALS_WITHIN_MS if on.type == CANCEL_TYPE else self._within.get(on.topic, 0)
-            self._topics[on] = line = GuardedTopic(*on, within)
-            self._tell(line)
+    def add_topic(self, topic: TypedTopic) -> None:
+        """See :meth:`GuardPort.add_topic <robot_client.motion.guard_port.GuardPort.add_topic>`."""
+        if topic not in self._topics:
+            within = (
+                GOALS_WITHIN_MS if topic.type == CANCEL_TYPE else self._within_by_topic.get(topic.name, 0)
+            )
+            self._topics[topic] = line = GuardedTopic(topic.name, topic.type, within)
+            self._send(line)
 
-    def shape(self, on: TypedTopic, rest: bytes) -> None:
-        """What commands on this topic look like when they are zero."""
-        self._shapes[on] = line = ZeroShape(*on, rest)
-        self._tell(line)
+    def set_zero_template(self, topic: TypedTopic, zero_template: bytes) -> None:
+        """See :meth:`GuardPort.set_zero_template <robot_client.motion.guard_port.GuardPort.set_zero_template>`."""
+        self._zero_templates[topic] = line = ZeroTemplate(topic.name, topic.type, zero_template)
+        self._send(line)
 
-    def forget(self, on: TypedTopic) -> None:
-        """No more commands will come on this topic."""
-        if self._topics.pop(on, None) is not None:
-            self._commands.pop(on, None)
-            self._shapes.pop(on, None)
-            self._ready.discard(on)
-            self._tell(Forget(*on))
+    def forget(self, topic: TypedTopic) -> None:
+        """See :meth:`GuardPort.forget <robot_client.motion.guard_port.GuardPort.forget>`."""
+        if self._topics.pop(topic, None) is not None:
+            self._commands.pop(topic, None)
+            self._zero_templates.pop(topic, None)
+            self._ready.discard(topic)
+            self._send(Forget(topic.name, topic.type))
 
-    def command(self, on: TypedTopic, moving: bool, at: int) -> None:
-        """A command went out."""
-        stood = not self._moving
-        self._commands[on] = line = GuardedCommand(*on, moving, at)
-        self._tell(line)
-        if moving and stood and self._process is not None and self._left is None:
+    def note_command(self, topic: TypedTopic, moving: bool, at: int) -> None:
+        """See :meth:`GuardPort.note_command <robot_client.motion.guard_port.GuardPort.note_command>`."""
+        was_still = not self._moving
+        self._commands[topic] = line = GuardedCommand(topic.name, topic.type, moving, at)
+        self._send(line)
+        if moving and was_still and self._process is not None and self._exited is None:
             self._probe_at_once()
 
-    def ready(self, on: TypedTopic) -> bool:
-        """Whether the guard that lives now could stop this topic, as far as its answers tell."""
-        doubtful = self._asked is not None and self._reactor.seconds() - self._asked > DOUBTFUL
-        return on in self._ready and not doubtful
+    def ready(self, topic: TypedTopic) -> bool:
+        """Whether the running guard could stop this topic, judged by its answers."""
+        doubtful = self._probed_at is not None and self._reactor.seconds() - self._probed_at > DOUBTFUL_AFTER
+        return topic in self._ready and not doubtful
 
-    def heard(self, line: bytes) -> None:
-        """The guard answered, or something in its process wrote where it answers."""
+    def on_line(self, line: bytes) -> None:
+        """Handle a line of the guard's output; lines that are no answers are ignored."""
         try:
             answer = answer_decoder.decode(line)
         except msgspec.MsgspecError:
             return
-        self._heard = self._reactor.seconds()
-        self._asked = None
+        self._answered_at = self._reactor.seconds()
+        self._probed_at = None
         if self._failures:
-            self.on_alert("info", "the motion guard is there again", MODULE, "guard", over=True)
+            self.on_alert("info", "the motion guard works again", MODULE, "guard", over=True)
         self._failures = 0
-        # A word about a topic that was forgotten meanwhile must not count when the topic comes back.
-        if isinstance(answer, TopicReady) and answer.on in self._topics:
-            self._ready.add(answer.on)
+        # An answer about a topic that was forgotten in the meantime must not count when the topic returns.
+        if isinstance(answer, TopicReady) and answer.typed_topic in self._topics:
+            self._ready.add(answer.typed_topic)
 
-    def lost(self, why: str) -> None:
-        """The guard is gone; get another."""
+    def on_exit(self, reason: str) -> None:
+        """The guard's process has ended: start another after a pause, except after :meth:`stop`."""
         self._process = None
         self._ready.clear()
-        self._asked = None
+        self._probed_at = None
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         self._timer = None
-        if self._left is not None:
-            self._left.callback(None)
+        if self._exited is not None:
+            self._exited.callback(None)
             return
-        least, most = RESTART
+        least, most = RESTART_PAUSES
         delay = min(most, least * 2**self._failures)
         self._failures += 1
-        text = f"the motion guard is gone ({why}); another one is started in {delay:.0f} s"
+        text = f"the motion guard has ended ({reason}); it is started again in {delay:.0f} s"
         self.on_alert("error", text, MODULE, "guard")
         self._timer = self._reactor.callLater(delay, self.start)
 
     def _arguments(self) -> list[str]:
-        # The network remembers a dead node for a while; one of the same name would be mistaken for it.
+        # DDS discovery remembers a dead node for a while; a node of the same name would be mistaken for it.
         node = f"{self._node}_{self._started}" if self._started else self._node
         self._started += 1
-        told = ["-m", "robot_client.motion.guard", "--node", node, "--within-ms", self._within_ms]
-        return [*told, "--sim-time"] if self._sim_time else told
+        arguments = ["-m", "robot_client.motion.guard", "--node", node, "--within-ms", self._within_ms]
+        return [*arguments, "--sim-time"] if self._sim_time else arguments
 
-    def _tell(self, line: Line) -> None:
+    def _send(self, line: Line) -> None:
         if self._process is not None:
-            self._process.tell(encode(line))
+            self._process.send(encode(line))
 
     def _probe(self) -> None:
         self._timer = None
         if self._process is None:
             return
-        if self._reactor.seconds() - self._heard > SILENT:
-            self._log.warn("the motion guard does not answer; it is ended and started anew")
+        if self._reactor.seconds() - self._answered_at > FROZEN_AFTER:
+            self._log.warn("the motion guard does not answer; it is killed and started again")
             self._process.kill()
             return
-        self._process.tell(encode(Probe()))
-        if self._asked is None:
-            self._asked = self._reactor.seconds()
-        self._timer = self._reactor.callLater(self._pause, self._probe)
+        self._process.send(encode(Probe()))
+        if self._probed_at is None:
+            self._probed_at = self._reactor.seconds()
+        self._timer = self._reactor.callLater(self._probe_interval, self._probe)
 
     def _probe_at_once(self) -> None:
         if self._timer is not None and self._timer.active():
@@ -211,5 +218,5 @@ class GuardSupervisor:
         return any(each.moving for each in self._commands.values())
 
     @property
-    def _pause(self) -> float:
+    def _probe_interval(self) -> float:
         return PROBE_MOVING if self._moving else PROBE_EVERY

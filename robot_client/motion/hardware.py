@@ -1,7 +1,8 @@
-"""A further stop in the robot's hardware: a service of the robot, a program on it, or both, as the settings say.
+"""Stops the robot's hardware by a service of the robot, a program on it, or both, as configured.
 
-It comes after zero was said, and is never waited for longer than :data:`PATIENCE` and :data:`DYING`, or twice that in
-the middle of a resume. What failed is thrown again as long as the robot is stopped.
+Each is a switch, set at a stop and released at a resume. Zero velocity is published first. Setting the switches takes
+at most :data:`SWITCH_SECONDS` plus :data:`KILL_SECONDS`, twice that when it begins during a resume. A switch that
+failed is set again as long as the robot is stopped.
 """
 
 from __future__ import annotations
@@ -18,32 +19,32 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
-from relay_protocol.text import inert
+from relay_protocol.text import escape_unprintable
 from robot_client.platforms.base import Platform
 
-PATIENCE = 5.0
+SWITCH_SECONDS = 5.0
 """Seconds a service or a program may take."""
 
-DYING = 1.0
-"""Seconds a program may take to be gone when it is killed."""
+KILL_SECONDS = 1.0
+"""Seconds a program may take to end after SIGKILL."""
 
-LOOKS = 30
-"""How often, a second apart, what failed is thrown again, and how often a daemon that starts stopped looks for the
-service before it says that there is none: nodes may start after it."""
+FREQUENT_RETRIES = 30
+"""How often, one second apart, a failed switch is set again. A daemon that starts stopped also looks for the service
+this often before it reports that there is none, as nodes may start after it."""
 
-RARELY = 10
-"""After that only each so many looks."""
+RARE_RETRY_INTERVAL = 10
+"""After :data:`FREQUENT_RETRIES`, only every RARE_RETRY_INTERVAL-th call of :meth:`Hardware.retry` tries again."""
 
 TRIGGER = "std_srvs/srv/Trigger"
 SET_BOOL = "std_srvs/srv/SetBool"
-WORDS = 200
-"""Most characters of what a service or a program says about its failure."""
+MAX_QUOTED = 200
+"""Most characters quoted from the message of a service, or the error output of a program."""
 
 _CDR = b"\0\1\0\0"
 
 
 class Switches(NamedTuple):
-    """What is to be done beside saying zero.
+    """The settings of the hardware switches.
 
     :param call: service of type Trigger, called at a stop, or SetBool, called with true at a stop and with false at a
         resume; empty for none
@@ -61,129 +62,142 @@ _ALL = frozenset((_CALL, _PROGRAM))
 
 
 class Hardware:
-    """Throws the switches.
+    """Sets and releases the switches.
 
     :param reactor: for timers and programs
     """
 
     def __init__(self, switches: Switches, platform: Platform, reactor: Any) -> None:
-        self.on_owed: Callable[[list[str]], None] = lambda problems: None
-        """Told what a stop has not achieved, in words, and with none when it has."""
+        self.on_problems: Callable[[list[str]], None] = lambda problems: None
+        """Called with sentences about switches that could not be set; with none when all are set."""
         self._switches = switches
         self._platform = platform
         self._reactor = reactor
         self._types: list[str] = []
-        """Of the service, as it was found last."""
-        self._prepared = ""
-        """The type of which a client is kept."""
-        self._owed: dict[str, str] = {}
-        """What is still to be thrown, and what went wrong with it; empty where it was not tried."""
-        self._looks = 0
-        self._patient = False
-        """Whether the service may yet come: nobody is told so soon that it is not there."""
-        self._again: Deferred[None] | None = None
-        """While something is thrown again: fires when that has ended."""
-        self._stopping: list[Deferred[list[str]]] = []
-        """Who waits for a stop under way."""
+        """Types of the service, as last found in the graph."""
+        self._prepared_type = ""
+        """The type for which the platform keeps a client; empty before the service was found."""
+        self._pending: dict[str, str] = {}
+        """By switch still to be set, a sentence about its failure; empty where it was not tried."""
+        self._attempts = 0
+        self._expect_service = False
+        """Whether the service may still appear; until then its absence is not reported."""
+        self._retry_done: Deferred[None] | None = None
+        """While failed switches are set again: fires when that has ended."""
+        self._stop_waiters: list[Deferred[list[str]]] = []
+        """Callers of a stop that is under way."""
         self._resuming = False
-        self._overtaken: list[Deferred[None]] = []
-        """Stops that came while a resume was under way."""
+        self._stops_during_resume: list[Deferred[None]] = []
+        """Stops requested while a resume is under way; they fire when it ends."""
         self._log = Logger("hardware")
 
-    def begin(self) -> None:
-        """The robot is stopped since before this start: :meth:`look` throws the switches when they are there."""
-        self._owed, self._looks, self._patient = dict.fromkeys(_ALL, ""), 0, True
+    def begin_stopped(self) -> None:
+        """Begin with a robot stopped before the daemon started: :meth:`retry` sets the switches when it can."""
+        self._pending, self._attempts, self._expect_service = dict.fromkeys(_ALL, ""), 0, True
 
     def prepare(self) -> None:
-        """Find the service before it is needed, and keep what calls it; to be called every second."""
-        if self._switches.call and not self._prepared:
+        """Find the service and prepare its client before it is needed; to be called every second."""
+        if self._switches.call and not self._prepared_type:
             try:
-                self._find()
-            except Exception:  # a look that fails must not be the last one
+                self._find_service()
+            except Exception:  # one failure must not end the periodic calls
                 self._log.failure("the graph could not be read")
 
-    def look(self) -> None:
-        """Throw again what failed; to be called every second while the robot is stopped, and is not being stopped."""
-        if not self._owed or self._again is not None or self._resuming:
+    def retry(self) -> None:
+        """Set failed switches again; to be called every second while the robot is stopped and no stop is under way."""
+        if not self._pending or self._retry_done is not None or self._resuming:
             return
-        self._looks += 1
-        if self._looks > LOOKS and self._looks % RARELY:
+        self._attempts += 1
+        if self._attempts > FREQUENT_RETRIES and self._attempts % RARE_RETRY_INTERVAL:
             return
-        which = frozenset(self._owed)
-        if self._patient and self._looks < LOOKS and self._switches.call and not self._prepared:
-            which -= {_CALL}  # the program waits for no service
+        which = frozenset(self._pending)
+        if (
+            self._expect_service
+            and self._attempts < FREQUENT_RETRIES
+            and self._switches.call
+            and not self._prepared_type
+        ):
+            which -= {_CALL}  # the program does not wait for the service
             if not which or not self._switches.stop:
                 return
         else:
-            self._patient = False
-        self._again = Deferred()
-        thrown = maybeDeferred(self._stop, which)
-        thrown.addErrback(self._unforeseen).addCallback(self._thrown_again)
+            self._expect_service = False
+        self._retry_done = Deferred()
+        retried = maybeDeferred(self._stop, which)
+        retried.addErrback(self._log_unexpected).addCallback(self._retry_ended)
 
     def stop(self) -> Deferred[list[str]]:
-        """Stop; fires with what went wrong, in words.
+        """Set all switches; fires with sentences about failures.
 
-        One that is under way counts for all who ask meanwhile. What is under way of a resume may undo it, so then it is
-        done once more when that has ended.
+        Calls made while a stop is under way share its result. A resume under way may undo the stop, so the switches
+        are then set once more after the resume has ended.
         """
-        self._looks, self._patient = 0, False
+        self._attempts, self._expect_service = 0, False
         stopped: Deferred[list[str]] = Deferred()
-        self._stopping.append(stopped)
-        if len(self._stopping) == 1:
-            maybeDeferred(self._stop_surely).addErrback(self._unforeseen).addCallback(self._stopped)
+        self._stop_waiters.append(stopped)
+        if len(self._stop_waiters) == 1:
+            maybeDeferred(self._stop_despite_resume).addErrback(self._log_unexpected).addCallback(
+                self._notify_stopped
+            )
         return stopped
 
-    def _stop_surely(self) -> Deferred[list[str]]:
-        thrown = self._stop()
+    def _stop_despite_resume(self) -> Deferred[list[str]]:
+        stopped = self._stop()
         if not self._resuming:
-            return thrown
-        over: Deferred[None] = Deferred()
-        self._overtaken.append(over)
-        last = over.addCallback(lambda _: self._stop())
-        return thrown.addCallback(lambda _: last)
+            return stopped
+        resumed: Deferred[None] = Deferred()
+        self._stops_during_resume.append(resumed)
+        last = resumed.addCallback(lambda _: self._stop())
+        return stopped.addCallback(lambda _: last)
 
-    def _stopped(self, problems: list[str]) -> None:
-        stopping, self._stopping = self._stopping, []
-        for each in stopping:
+    def _notify_stopped(self, problems: list[str]) -> None:
+        waiters, self._stop_waiters = self._stop_waiters, []
+        for each in waiters:
             each.callback(list(problems))
 
     def resume(self) -> Deferred[list[str]]:
-        """Let go again; fires with what went wrong, in words. One at a time."""
+        """Release all switches; fires with sentences about failures. One call at a time."""
         self._resuming = True
-        ready = self._again or succeed(None)
-        let_go = ready.addCallback(lambda _: self._let_go())
-        let_go.addErrback(lambda failure: {_CALL: self._unforeseen(failure)[0]})
-        return let_go.addCallback(self._resumed)
+        retry_ended = self._retry_done or succeed(None)
+        released = retry_ended.addCallback(lambda _: self._release())
+        released.addErrback(lambda failure: {_CALL: self._log_unexpected(failure)[0]})
+        return released.addCallback(self._notify_resumed)
 
-    def _let_go(self) -> Deferred[dict[str, str]]:
-        if self._overtaken:  # a stop came while it was waited: what it has thrown must not be undone
+    def _release(self) -> Deferred[dict[str, str]]:
+        if self._stops_during_resume:  # a stop came during the wait: its switches must stay set
             return succeed({})
-        self._owed = {}
-        return self._throw(False, _ALL)
+        self._pending = {}
+        return self._set_switches(False, _ALL)
 
-    def _resumed(self, problems: dict[str, str]) -> list[str]:
+    def _notify_resumed(self, problems: dict[str, str]) -> list[str]:
         self._resuming = False
-        overtaken, self._overtaken = self._overtaken, []
-        for each in overtaken:
+        waiters, self._stops_during_resume = self._stops_during_resume, []
+        for each in waiters:
             each.callback(None)
         return list(problems.values())
 
     def _stop(self, which: frozenset[str] = _ALL) -> Deferred[list[str]]:
-        return self._throw(True, which).addCallback(self._thrown, which)
+        return self._set_switches(True, which).addCallback(self._record_problems, which)
 
-    def _thrown(self, problems: dict[str, str], which: frozenset[str]) -> list[str]:
-        """It stands whatever was thrown meanwhile: only a resume lets go, and that waits for this."""
-        self._owed = {name: words for name, words in self._owed.items() if name not in which} | problems
-        self.on_owed([words for words in self._owed.values() if words])
+    def _record_problems(self, problems: dict[str, str], which: frozenset[str]) -> list[str]:
+        """Note the problems of these switches. Only a resume releases switches, and it waits for this."""
+        self._pending = {
+            name: sentence for name, sentence in self._pending.items() if name not in which
+        } | problems
+        self.on_problems([sentence for sentence in self._pending.values() if sentence])
         return list(problems.values())
 
-    def _thrown_again(self, problems: list[str]) -> None:
-        again, self._again = self._again, None
-        if again is not None:
-            again.callback(None)
+    def _retry_ended(self, problems: list[str]) -> None:
+        retry, self._retry_done = self._retry_done, None
+        if retry is not None:
+            retry.callback(None)
 
-    def _throw(self, stop: bool, which: frozenset[str]) -> Deferred[dict[str, str]]:
-        """Throw these; fires with what went wrong, in words, by switch."""
+    def _set_switches(self, stop: bool, which: frozenset[str]) -> Deferred[dict[str, str]]:
+        """Set switches, or release them; fires with a sentence about each that failed.
+
+        :param stop: whether to set them
+        :param which: the switches, of :data:`_ALL`
+        """
         under_way: dict[str, Deferred[None]] = {}
         if self._switches.call and _CALL in which:
             under_way[_CALL] = maybeDeferred(self._call, self._switches.call, stop)
@@ -192,32 +206,34 @@ class Hardware:
             under_way[_PROGRAM] = maybeDeferred(run, self._reactor, command)
         gathered: Deferred[Any] = DeferredList(list(under_way.values()), consumeErrors=True)
         return gathered.addCallback(
-            lambda ends: {
-                name: self._words(end) for name, (good, end) in zip(under_way, ends, strict=True) if not good
+            lambda results: {
+                name: self._describe(failure)
+                for name, (succeeded, failure) in zip(under_way, results, strict=True)
+                if not succeeded
             }
         )
 
-    def _find(self) -> None:
-        """Look for the service in the graph; where it is, have its client kept."""
+    def _find_service(self) -> None:
+        """Look for the service in the graph; where it exists, have the platform keep a client."""
         call = self._switches.call
         known = self._platform.graph().services.get(self._platform.full_name(call, "service"))
         if known is None:
             return
         self._types = known.types
         type = self._type
-        if type and type != self._prepared:
-            self._prepared = type
+        if type and type != self._prepared_type:
+            self._prepared_type = type
             self._platform.prepare_call(call, type)
 
     @property
     def _type(self) -> str:
-        """The type the service is called by; empty: it is not there, or of none that is known."""
+        """The type used to call the service; empty: there is no service, or none of a known type."""
         return next((each for each in (SET_BOOL, TRIGGER) if each in self._types), "")
 
     def _call(self, service: str, stop: bool) -> Deferred[None]:
         try:
-            self._find()
-        except Exception:  # it may still be as it was found
+            self._find_service()
+        except Exception:  # the types found before may still hold
             self._log.failure("the graph could not be read")
         type = self._type
         if type == SET_BOOL:
@@ -230,24 +246,27 @@ class Hardware:
             return fail(NotFound(f"there is no service {service} on this robot"))
         else:
             return fail(Invalid(f"the service {service} is neither {TRIGGER} nor {SET_BOOL}"))
-        answer = self._platform.call(service, type, request, PATIENCE)
-        answer.addTimeout(PATIENCE, self._reactor, onTimeoutCancel=lambda *_: _late(service))
-        return answer.addCallback(lambda body: _check(service, body))
+        answer = self._platform.call(service, type, request, SWITCH_SECONDS)
+        answer.addTimeout(SWITCH_SECONDS, self._reactor, onTimeoutCancel=lambda *_: _timeout_failure(service))
+        return answer.addCallback(lambda body: _check_response(service, body))
 
-    def _words(self, failure: Failure) -> str:
+    def _describe(self, failure: Failure) -> str:
         if isinstance(failure.value, SwitchboardError):
             return failure.getErrorMessage()
-        return self._unforeseen(failure)[0]
+        return self._log_unexpected(failure)[0]
 
-    def _unforeseen(self, failure: Failure) -> list[str]:
-        self._log.failure("a switch in the hardware failed", failure)
-        return ["a switch in the hardware failed; the robot's log says why"]
+    def _log_unexpected(self, failure: Failure) -> list[str]:
+        self._log.failure("a hardware switch failed", failure)
+        return ["a hardware switch failed; the robot's log says why"]
 
 
 def run(reactor: Any, command: Sequence[str]) -> Deferred[None]:
-    """Run a program without a shell; fails in words unless it ends with 0 within :data:`PATIENCE`.
+    """Run a program without a shell.
 
-    One that is not gone :data:`DYING` after it was killed, or that must not be killed, is left alone.
+    A program still running after :data:`SWITCH_SECONDS` is killed. One that survives this for
+    :data:`KILL_SECONDS`, or can't be killed, is left running.
+
+    :return: fires when the program ends with 0; else fails with :class:`~relay_protocol.errors.Unavailable`
     """
     program = _Program(reactor, command[0])
     try:
@@ -269,70 +288,73 @@ class _Program(ProcessProtocol):
     def __init__(self, reactor: Any, name: str) -> None:
         self.done: Deferred[None] = Deferred()
         self._name = name
-        self._said = b""
-        self._late = False
+        self._stderr = b""
+        self._timed_out = False
         self._reactor = reactor
-        self._timer = reactor.callLater(PATIENCE, self._kill)
+        self._timer = reactor.callLater(SWITCH_SECONDS, self._kill)
 
     def connectionMade(self) -> None:
-        """Tell it nothing."""
+        """Close its standard input."""
         self.transport.closeStdin()
 
     def outReceived(self, data: bytes) -> None:
-        """Let it go."""
+        """Ignore its standard output."""
 
     def errReceived(self, data: bytes) -> None:
-        """Keep its last words."""
-        self._said = (self._said + data)[-4 * WORDS :]
+        """Keep the end of its error output for the message."""
+        self._stderr = (self._stderr + data)[-4 * MAX_QUOTED :]
 
     def processExited(self, reason: Failure) -> None:
-        """It is gone, perhaps with children that still hold its pipes."""
+        """Report the result without waiting for the pipes, which its children may still hold."""
         if self._timer.active():
             self._timer.cancel()
         self.transport.loseConnection()
         if self.done.called:
             return
         code = getattr(reason.value, "exitCode", None)
-        if code == 0 and not self._late:
+        if code == 0 and not self._timed_out:
             self.done.callback(None)
             return
-        self._fail(f"did not end within {PATIENCE:g} s" if self._late else f"ended with {code}")
+        self._fail(f"did not end within {SWITCH_SECONDS:g} s" if self._timed_out else f"ended with {code}")
 
     def _kill(self) -> None:
-        self._late = True
+        self._timed_out = True
         try:
             self.transport.signalProcess("KILL")
         except ProcessExitedAlready:
             return
-        except OSError as error:  # it runs as somebody else
-            self._fail(f"did not end within {PATIENCE:g} s and can't be killed ({error.strerror})")
+        except OSError as error:  # it runs as another user
+            self._fail(f"did not end within {SWITCH_SECONDS:g} s and can't be killed ({error.strerror})")
             return
-        self._timer = self._reactor.callLater(DYING, self._give_up)
+        self._timer = self._reactor.callLater(KILL_SECONDS, self._give_up)
 
     def _give_up(self) -> None:
-        """It is held up in the kernel, for instance by a device that does not answer."""
-        self._fail(f"did not end within {PATIENCE:g} s, and does not die")
+        """Stop waiting: the program hangs in the kernel, for instance in a device that does not answer."""
+        self._fail(f"did not end within {SWITCH_SECONDS:g} s, and could not be killed")
 
     def _fail(self, how: str) -> None:
-        lines = self._said.decode(errors="replace").split("\n")
-        words = inert(next((each.strip() for each in reversed(lines) if each.strip()), ""))[:WORDS]
-        self.done.errback(Unavailable(f"{self._name} {how}" + (f": {words}" if words else "")))
+        lines = self._stderr.decode(errors="replace").split("\n")
+        last_line = escape_unprintable(next((each.strip() for each in reversed(lines) if each.strip()), ""))[
+            :MAX_QUOTED
+        ]
+        self.done.errback(Unavailable(f"{self._name} {how}" + (f": {last_line}" if last_line else "")))
 
 
-def _late(service: str) -> Failure:
-    return Failure(Unavailable(f"the service {service} did not answer within {PATIENCE:g} s"))
+def _timeout_failure(service: str) -> Failure:
+    return Failure(Unavailable(f"the service {service} did not answer within {SWITCH_SECONDS:g} s"))
 
 
-def _check(service: str, body: bytes) -> None:
-    """Read ``success`` and ``message``, which both types begin with.
+def _check_response(service: str, body: bytes) -> None:
+    """Read ``success`` and ``message``, with which responses of both types begin.
 
-    :raises Unavailable: it failed
+    :param body: CDR
+    :raises Unavailable: the service reports a failure
     """
     if len(body) > 4 and body[4]:
         return
-    words = ""
+    message = ""
     if len(body) >= 12:
         order = "<" if body[1] & 1 else ">"
         (length,) = struct.unpack_from(order + "I", body, 8)
-        words = inert(body[12 : 12 + max(0, length - 1)].decode(errors="replace"))[:WORDS]
-    raise Unavailable(f"the service {service} says it could not" + (f": {words}" if words else ""))
+        message = escape_unprintable(body[12 : 12 + max(0, length - 1)].decode(errors="replace"))[:MAX_QUOTED]
+    raise Unavailable(f"the service {service} reported a failure" + (f": {message}" if message else ""))

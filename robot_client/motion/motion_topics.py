@@ -1,4 +1,4 @@
-"""What is known of one topic that moves the robot."""
+"""The state of each topic that moves the robot, and the bounded set of topics that the guard covers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from relay_protocol.errors import Unavailable
-from robot_client.motion.authority import NOBODY
+from robot_client.motion.authority import NO_SOURCE
 from robot_client.motion.guard_port import GuardPort
 from robot_client.motion.ramp import Ramp
 from robot_client.motion.typed_topic import TypedTopic
@@ -14,57 +14,58 @@ from robot_client.platforms.base import PublisherHandle
 from robot_client.twisted_types import DelayedCall
 
 MAX_TOPICS = 64
+"""Most topics that the guard covers at a time."""
 
 
-class MotionPublisher(NamedTuple):
-    """Where the commands of one publication go."""
+class MotionPublication(NamedTuple):
+    """A client's publication that may move the robot: its topic, and the platform's publisher for it."""
 
-    on: TypedTopic
-    sink: PublisherHandle
+    topic: TypedTopic
+    publisher: PublisherHandle
 
 
 class MotionTopic:
-    """One motion topic.
+    """The state of one motion topic.
 
-    :attr sources: publications that may command it
-    :attr leaving: sinks to close when the last zero is said
-    :attr speaker: sink of the last command; what it says arrives after that command, what another says may not
-    :attr mover: who gave the last command to move
-    :attr latest: by when zero must be said after it, nanoseconds
-    :attr body: that command; empty where nobody will want to know
-    :attr used: when somebody who might commanded it last, nanoseconds
-    :attr rest: what its zero looks like, see ``Platform.resting``
-    :attr ramp: on the way to a standstill
-    :attr zeros: how often zero is still to be said
-    :attr timer: for the next zero or step of a ramp; without sources and those, for being forgotten
+    :ivar publication_ids: ids of publications that may command it
+    :ivar ended_publishers: publishers of ended publications, to close after the last zero
+    :ivar last_publisher: of the last command; zero goes out on it too, as DDS keeps the order only within one publisher
+    :ivar moved_by: connection that sent the last command to move
+    :ivar latest_stop: when zero must be published after that command at the latest, nanoseconds
+    :ivar last_command: that command; empty where ramps are off
+    :ivar used_at: when an allowed connection last commanded it, nanoseconds
+    :ivar zero_template: see ``Platform.zero_template``
+    :ivar ramp: the ramp to a standstill that is under way
+    :ivar zeros_left: how many zeros are still to be published
+    :ivar timer: for the next zero or step of a ramp; on an idle topic, for forgetting it
     """
 
     def __init__(self) -> None:
-        self.sources: set[str] = set()
-        self.leaving: list[PublisherHandle] = []
-        self.speaker: PublisherHandle | None = None
-        self.mover = NOBODY
-        self.latest = 0
-        self.body = b""
-        self.used = 0
-        self.rest = b""
+        self.publication_ids: set[str] = set()
+        self.ended_publishers: list[PublisherHandle] = []
+        self.last_publisher: PublisherHandle | None = None
+        self.moved_by = NO_SOURCE
+        self.latest_stop = 0
+        self.last_command = b""
+        self.used_at = 0
+        self.zero_template = b""
         self.ramp: Ramp | None = None
-        self.zeros = 0
+        self.zeros_left = 0
         self.timer: DelayedCall | None = None
 
     @property
-    def busy(self) -> bool:
-        """Whether it has yet to come to a standstill."""
-        return bool(self.zeros) or self.ramp is not None
+    def is_stopping(self) -> bool:
+        """Whether a ramp or zeros are under way."""
+        return bool(self.zeros_left) or self.ramp is not None
 
     @property
-    def idle(self) -> bool:
-        """Whether nobody needs it."""
-        return not self.sources and not self.busy
+    def is_idle(self) -> bool:
+        """Whether it has no publications, and no stop is under way."""
+        return not self.publication_ids and not self.is_stopping
 
-    def settle(self) -> None:
-        """Nothing is to come."""
-        self.zeros = 0
+    def cancel_timers(self) -> None:
+        """Cancel the ramp, the zeros, and forgetting an idle topic."""
+        self.zeros_left = 0
         self.ramp = None
         if self.timer is not None and self.timer.active():
             self.timer.cancel()
@@ -72,46 +73,49 @@ class MotionTopic:
 
 
 class MotionTopics(dict[TypedTopic, MotionTopic]):
-    """The topics for which the guard has places.
+    """The topics that the guard covers, at most :data:`MAX_TOPICS`, as each costs the guard a publisher.
 
-    The guard has few, as each costs it a publisher: who only advertises topics must take none from who commands one.
+    A full set evicts the topic least needed, so that clients that only advertise topics can't displace commanded ones.
 
-    :param moves: whether a topic is to move now
+    :param moves: whether a topic moves now
     """
 
     def __init__(self, guard: GuardPort, moves: Callable[[TypedTopic], bool]) -> None:
         super().__init__()
-        self.forgotten: Callable[[TypedTopic], None] = lambda on: None
-        """Called when one has no place any more."""
+        self.on_forgotten: Callable[[TypedTopic], None] = lambda topic: None
+        """Called when a topic was evicted or forgotten."""
         self._guard = guard
         self._moves = moves
 
-    def take(self, on: TypedTopic, sources: Iterable[str]) -> MotionTopic:
-        """What is known of a topic that has a place, or gets that of the one least needed.
+    def acquire(self, topic: TypedTopic, publication_ids: Iterable[str]) -> MotionTopic:
+        """Return the state of a topic; add the topic where it is missing, which may evict another.
 
-        :param sources: publications that may command it, where it had none
-        :raises Unavailable: all topics that have places move
+        :param publication_ids: ids of publications that may command it; used only when it is added
+        :raises Unavailable: the set is full and all its topics move
         """
-        if on not in self:
-            for other in [each for each, track in self.items() if each.topic == on.topic and track.idle]:
-                self.forget(other)  # some middleware allows one type of a topic in a process
+        if topic not in self:
+            for other in [each for each, state in self.items() if each.name == topic.name and state.is_idle]:
+                self.forget(other)  # some middleware allows only one type per topic in a process
             self._make_room()
-            self[on] = MotionTopic()
-            self[on].sources.update(sources)
-            self._guard.topic(on)
-        return self[on]
+            self[topic] = MotionTopic()
+            self[topic].publication_ids.update(publication_ids)
+            self._guard.add_topic(topic)
+        return self[topic]
 
-    def forget(self, on: TypedTopic) -> None:
-        """Take its place away."""
-        self.pop(on).settle()
-        self.forgotten(on)
-        self._guard.forget(on)
+    def forget(self, topic: TypedTopic) -> None:
+        """Remove a topic."""
+        self.pop(topic).cancel_timers()
+        self.on_forgotten(topic)
+        self._guard.forget(topic)
 
     def _make_room(self) -> None:
-        """Give up one that nobody needs, else the one that was commanded longest ago, or never."""
+        """Evict an idle topic, else the still one whose last command is the oldest."""
         if len(self) < MAX_TOPICS:
             return
-        still = [on for on, track in self.items() if not track.busy and not self._moves(on)]
+        still = [topic for topic, state in self.items() if not state.is_stopping and not self._moves(topic)]
         if not still:
-            raise Unavailable(f"{MAX_TOPICS} topics move the robot at this moment; let go of one first")
-        self.forget(min(still, key=lambda on: (not self[on].idle, self[on].used)))
+            raise Unavailable(
+                f"{MAX_TOPICS} topics move the robot at this moment, the most there may be; "
+                "stop commanding one of them first"
+            )
+        self.forget(min(still, key=lambda topic: (not self[topic].is_idle, self[topic].used_at)))

@@ -1,4 +1,4 @@
-"""Coming to a standstill over a time instead of at once. Pure: times in, speeds out."""
+"""Linear ramps to a standstill. Pure: times in, speeds out."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import NamedTuple
 from robot_client.motion.velocity import Velocity
 
 STEP = 20_000_000
-"""Nanoseconds from one command of a ramp to the next."""
+"""Nanoseconds between two commands of a ramp."""
 
 
 class Ramp(NamedTuple):
-    """The way from the last command to zero.
+    """A linear ramp from the last command to zero.
 
-    :ivar velocity: what was asked for last
-    :ivar since: when it begins, monotonic nanoseconds
-    :ivar until: when it must be over
+    :ivar velocity: of the last command
+    :ivar since: when the ramp begins, monotonic nanoseconds
+    :ivar until: when it ends, monotonic nanoseconds
     """
 
     velocity: Velocity
@@ -23,9 +23,9 @@ class Ramp(NamedTuple):
     until: int
 
     def at(self, now: int) -> Velocity | None:
-        """The speed at a moment; ``None`` when it is time for zero.
+        """The speed at a time; ``None``: the ramp is over, so publish zero.
 
-        Never faster than at the beginning, whatever the clock says.
+        Never faster than at the beginning, even if the clock goes back.
         """
         if now >= self.until:
             return None
@@ -33,10 +33,10 @@ class Ramp(NamedTuple):
 
 
 def ramp(velocity: Velocity, now: int, length: int, latest: int) -> Ramp | None:
-    """A ramp that begins now, ``None`` where there is no time for one.
+    """A ramp that begins now; ``None``: no time is left, or nothing moves.
 
-    :param length: nanoseconds it takes where there is time
-    :param latest: moment by which zero must be said
+    :param length: nanoseconds it takes, where time allows
+    :param latest: when zero must be published at the latest, monotonic nanoseconds
     """
     until = min(now + length, latest)
     return Ramp(velocity, now, until) if until - now > STEP and velocity.moves else None

@@ -1,4 +1,4 @@
-"""The rest of the robot, as the helm sees it."""
+"""The interface of the daemon to the motion code."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from relay_protocol import link
 
 
 class RobotPort(Protocol):
-    """What the helm needs of the rest of the robot."""
+    """The rest of the daemon, as :class:`robot_client.motion.order_handler.ControlOrderHandler` uses it."""
 
-    def say(self, message: link.Message) -> None:
-        """Tell the relay, if it is there."""
+    def send(self, message: link.Message) -> None:
+        """Send a message to the relay; it is discarded if the robot is not registered."""
 
     def alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
-        """Tell a person, see :class:`robot_client.alerts.OnAlert`."""
+        """Raise an alert, see :class:`robot_client.alerts.OnAlert`."""
 
-    def topic(self, name: str) -> tuple[str, list[str]]:
+    def find_topic(self, name: str) -> tuple[str, list[str]]:
         """The full name of a topic, and its types: none where it does not exist.
 
-        :raises Invalid: it is no name
+        :raises Invalid: the name is not valid
         """
 
     def cancel_goals(self, only_moving: bool) -> None:
-        """Cancel what the robot's actions pursue for the relay."""
+        """Cancel the goals that the relay sent to the robot's actions; ``only_moving``: those that move the robot."""
 
-    def standing(self, seconds: float) -> Deferred[list[str]]:
-        """Fires with :attr:`pursued` when that is nothing, or nothing that can be waited for, or in so many seconds."""
-
-    @property
-    def pursued(self) -> list[str]:
-        """The actions that pursue something for the relay that moves the robot, as far as is known."""
+    def goals_ended(self, seconds: float) -> Deferred[list[str]]:
+        """Wait until all goals have ended that will end, or for ``seconds``; fires with :attr:`active_actions`."""
 
     @property
-    def overdue(self) -> list[str]:
-        """Those among them whose goals were to end, and may not have."""
+    def active_actions(self) -> list[str]:
+        """Actions known to execute goals of the relay that move the robot."""
 
-    def silence(self, topic: str) -> None:
-        """What :attr:`robot_client.motion.orders.OrderHandler.silent` says of a topic has changed."""
+    @property
+    def uncancelled_actions(self) -> list[str]:
+        """Actions among :attr:`active_actions` whose goals were cancelled, but may not have ended."""
+
+    def update_inhibition(self, topic: str) -> None:
+        """Apply a change of :attr:`robot_client.motion.order_handler.ControlOrderHandler.inhibited` for a topic."""

@@ -1,4 +1,4 @@
-"""What holds for commands and stops beside the policy that the relay is told."""
+"""Rules for commands and stops that are not part of the policy sent to the relay."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from typing import NamedTuple
 
 from relay_protocol.link.motion import Limits
 from robot_client.config import RobotSettings
-from robot_client.motion.limits import limits_told
-from robot_client.motion.safety import Times
+from robot_client.motion.limits import limits_by_level
+from robot_client.motion.watchdog import CommandTimes
 
 
 class MotionRules(NamedTuple):
-    """Of one robot.
+    """The rules of one robot.
 
-    :ivar topics: times of single topics
-    :ivar ramp_ms: how long it takes to a standstill where nobody said stop; 0: no time
-    :ivar limits: how fast whom may move it, by level
-    :ivar unlimited: patterns of topics on which commands pass whose speeds can't be read
+    :ivar topics: times of single topics, by name
+    :ivar ramp_ms: length of the ramp to a standstill when commands end without a stop, milliseconds; 0: no ramp
+    :ivar limits: speed and acceleration limits by level
+    :ivar unlimited: shell patterns of topics on which commands pass although their speed can't be read
     """
 
-    topics: Mapping[str, Times] = {}
+    topics: Mapping[str, CommandTimes] = {}
     ramp_ms: int = 0
     limits: Mapping[str, Limits] = {}
     unlimited: Sequence[str] = ()
 
 
 def rules_of(settings: RobotSettings) -> MotionRules:
-    """As the settings have them."""
+    """Build the rules from the settings."""
     safety = settings.safety
     return MotionRules(
         {each.name: safety.times(each.name) for each in safety.topic},
         safety.ramp_ms,
-        limits_told(settings),
+        limits_by_level(settings),
         settings.limits.unlimited,
     )

@@ -1,42 +1,31 @@
-"""What ``safety`` says (SPEC 2.4), and when: soon, not too often, and the last state always."""
+"""The state of motion that the robot reports (``motion_state``, SPEC 2.4), and how often."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 from relay_protocol import link
 from robot_client.motion.authority import Authority
-from robot_client.motion.safety import MILLI
+from robot_client.motion.command_age import MILLI
+from robot_client.motion.inhibition import Inhibition
 from robot_client.twisted_types import DelayedCall, ReactorClock
 
-TELL_EVERY = 0.05
-"""Seconds between two words, at least."""
+REPORT_EVERY = 0.05
+"""Least seconds between two reports."""
 
 
-class Inhibition(NamedTuple):
-    """A topic that says nothing, or with ``hold`` the last it said.
-
-    :param until: own clock, nanoseconds
-    """
-
-    hold: bool
-    until: int
-    by: str
-
-
-def safety(
+def motion_state(
     authority: Authority,
     moving: bool,
     inhibitions: Mapping[str, Inhibition],
     limits: dict[str, link.Limits],
     now: int,
-) -> link.Safety:
-    """How it is with what moves the robot.
+) -> link.MotionState:
+    """The state as the relay receives it.
 
     :param now: own clock, nanoseconds
     """
-    return link.Safety(
+    return link.MotionState(
         holder=authority.holder,
         moving=moving,
         stopped=authority.stopped,
@@ -59,40 +48,40 @@ def _left(until: int, now: int) -> int:
 
 
 class StateReporter:
-    """Paces what is said of one state.
+    """Reports a state when it changes: at most every :data:`REPORT_EVERY`, and always the last one.
 
-    :param say: says it as it is now
+    :param report: sends the present state
     """
 
-    def __init__(self, clock: ReactorClock, say: Callable[[], None]) -> None:
+    def __init__(self, clock: ReactorClock, report: Callable[[], None]) -> None:
         self._clock = clock
-        self._say = say
-        self._said_at: float | None = None
-        """When it was said last; ``None`` while nobody is there to hear it."""
+        self._report = report
+        self._reported_at: float | None = None
+        """When it was reported last; ``None`` while there is no link."""
         self._timer: DelayedCall | None = None
 
     def begin(self) -> None:
-        """Somebody is there to hear it: say it now, and from now on when it changes."""
-        self._said_at = self._clock.seconds()
-        self._say()
+        """There is a link: report the state now, and from now on when it changes."""
+        self._reported_at = self._clock.seconds()
+        self._report()
 
     def end(self) -> None:
-        """Nobody is there any more."""
-        self._said_at = None
+        """There is no link any more."""
+        self._reported_at = None
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
-    def changed(self) -> None:
-        """Say it now, or :data:`TELL_EVERY` after it was said last."""
-        if self._said_at is None or self._timer is not None:
+    def state_changed(self) -> None:
+        """Report now, or :data:`REPORT_EVERY` after the last report."""
+        if self._reported_at is None or self._timer is not None:
             return
-        wait = self._said_at + TELL_EVERY - self._clock.seconds()
+        wait = self._reported_at + REPORT_EVERY - self._clock.seconds()
         if wait <= 0:
             self.begin()
         else:
-            self._timer = self._clock.callLater(wait, self._again)
+            self._timer = self._clock.callLater(wait, self._report_again)
 
-    def _again(self) -> None:
+    def _report_again(self) -> None:
         self._timer = None
         self.begin()

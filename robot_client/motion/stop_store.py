@@ -1,4 +1,4 @@
-"""The record of a stop, and that a person hears of it while there is none."""
+"""Stores a stop for the next start of the daemon, and raises an alert while it can't be written."""
 
 from __future__ import annotations
 
@@ -13,84 +13,79 @@ from relay_protocol import link
 from relay_protocol.errors import Unavailable
 from robot_client.alerts import AlertCondition, OnAlert
 
-FILE = "stopped.json"
-GOALS = "goals.json"
-MOST = 64 * 1024
-"""Bytes of a record that are read; ours are far shorter."""
+STOP_FILE = "stopped.json"
+GOALS_FILE = "goals.json"
+MAX_BYTES = 64 * 1024
+"""Most bytes of a record that are read; valid records are far shorter."""
 
 
 class StopStore(Protocol):
-    """Where a stop is kept."""
+    """Stores a stop, and which actions execute goals, for the next start of the daemon."""
 
     def load(self) -> link.Stopped | None:
-        """The stop that was kept; ``None`` where there is none."""
+        """The stored stop; ``None``: the robot is not stopped."""
 
-    def keep(self, stopped: link.Stopped) -> None:
-        """Keep a stop; done when it is on the disk.
+    def store(self, stopped: link.Stopped) -> None:
+        """Store a stop; returns when it is on the disk.
 
-        :raises Unavailable: it can't be kept
+        :raises Unavailable: it can't be written
         """
 
     def clear(self) -> None:
-        """Keep none; done when that is on the disk.
+        """Remove the stop; returns when that is on the disk.
 
-        :raises Unavailable: it is still there
+        :raises Unavailable: it may still be there
         """
 
-    def goals(self) -> list[str] | None:
-        """The actions that were kept by :meth:`keep_goals`; ``None`` where nobody can tell which."""
+    def load_actions(self) -> list[str] | None:
+        """The actions stored by :meth:`store_actions`; ``None``: they can't be read."""
 
-    def keep_goals(self, actions: list[str]) -> None:
-        """Keep which actions pursue goals that move the robot.
+    def store_actions(self, actions: list[str]) -> None:
+        """Store which actions execute goals that move the robot.
 
-        :raises Unavailable: they can't be kept
+        :raises Unavailable: they can't be written
         """
 
 
 class MemoryStopStore(StopStore):
-    """Keeps it as long as the program runs."""
+    """Stores a stop in memory, as long as the program runs."""
 
     def __init__(self, stopped: link.Stopped | None = None) -> None:
         self.stopped = stopped
-        self.noted: list[str] | None = []
+        self.actions: list[str] | None = []
 
     def load(self) -> link.Stopped | None:
-        """The stop that was kept."""
         return self.stopped
 
-    def keep(self, stopped: link.Stopped) -> None:
-        """Keep a stop."""
+    def store(self, stopped: link.Stopped) -> None:
         self.stopped = stopped
 
     def clear(self) -> None:
-        """Keep none."""
         self.stopped = None
 
-    def goals(self) -> list[str] | None:
-        """The actions that were kept."""
-        return self.noted
+    def load_actions(self) -> list[str] | None:
+        return self.actions
 
-    def keep_goals(self, actions: list[str]) -> None:
-        """Keep which actions pursue goals."""
-        self.noted = actions
+    def store_actions(self, actions: list[str]) -> None:
+        self.actions = actions
 
 
 class DiskStopStore(StopStore):
-    """Keeps it in the daemon's state folder.
+    """Stores a stop in the daemon's state folder.
 
-    :param folder: is there
+    :param folder: must exist
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._path = folder / FILE
-        self._goals = folder / GOALS
+        self._path = folder / STOP_FILE
+        self._goals_path = folder / GOALS_FILE
 
     def load(self) -> link.Stopped | None:
-        """The stop that was kept; what can't be read counts as one."""
+        """The stored stop; a file that can't be read counts as a stop."""
         try:
             with self._path.open("rb") as file:
-                return msgspec.json.decode(file.read(MOST), type=link.Stopped)
+                return msgspec.json.decode(file.read(MAX_BYTES), type=link.Stopped)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -98,11 +93,11 @@ class DiskStopStore(StopStore):
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             why = "is damaged"
         reason = f"the record of a stop, {self._path}, {why}, so the robot counts as stopped"
-        return link.Stopped(by="the robot", since=self._since(), why=reason)
+        return link.Stopped(by="the robot", since=self._modified_at(), why=reason)
 
-    def keep(self, stopped: link.Stopped) -> None:
-        """Write it beside the old one, then put it in its place."""
-        pending = self._folder / (FILE + ".pending")
+    def store(self, stopped: link.Stopped) -> None:
+        """Write a new file, then rename it over the old one."""
+        pending = self._folder / (STOP_FILE + ".pending")
         try:
             handle = os.open(pending, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
             with os.fdopen(handle, "wb") as file:
@@ -110,56 +105,56 @@ class DiskStopStore(StopStore):
                 file.flush()
                 os.fsync(file.fileno())
             pending.replace(self._path)
-            self._sync()
+            self._sync_folder()
         except OSError as error:
-            raise Unavailable(f"the stop can't be kept through a restart: {error.strerror}") from None
+            raise Unavailable(f"the stop can't be stored for the next start: {error.strerror}") from None
 
     def clear(self) -> None:
-        """Take the record away."""
+        """Remove the record."""
         try:
             self._path.unlink(missing_ok=True)
-            self._sync()
+            self._sync_folder()
         except OSError as error:
             raise Unavailable(
-                f"the record of the stop, {self._path}, can't be taken away: {error.strerror}"
+                f"the record of the stop, {self._path}, can't be removed: {error.strerror}"
             ) from None
 
-    def goals(self) -> list[str] | None:
-        """The actions that were kept."""
+    def load_actions(self) -> list[str] | None:
+        """See :class:`StopStore`."""
         try:
-            with self._goals.open("rb") as file:
-                return msgspec.json.decode(file.read(MOST), type=list[str])
+            with self._goals_path.open("rb") as file:
+                return msgspec.json.decode(file.read(MAX_BYTES), type=list[str])
         except FileNotFoundError:
             return []
         except (OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return None
 
-    def keep_goals(self, actions: list[str]) -> None:
-        """Write them beside the old ones, then put them in their place.
+    def store_actions(self, actions: list[str]) -> None:
+        """Write a new file, then rename it over the old one.
 
-        Nobody waits for the disk: when the whole machine goes, its goals go with it.
+        It is not synced to the disk: a crash of the whole machine ends the goals as well.
         """
-        pending = self._folder / (GOALS + ".pending")
+        pending = self._folder / (GOALS_FILE + ".pending")
         try:
             if not actions:
-                self._goals.unlink(missing_ok=True)
+                self._goals_path.unlink(missing_ok=True)
                 return
             handle = os.open(pending, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
             with os.fdopen(handle, "wb") as file:
                 file.write(msgspec.json.encode(actions) + b"\n")
-            pending.replace(self._goals)
+            pending.replace(self._goals_path)
         except OSError as error:
             raise Unavailable(
-                f"which goals are under way can't be kept through a restart: {error.strerror}"
+                f"which goals are under way can't be stored for the next start: {error.strerror}"
             ) from None
 
-    def _since(self) -> float:
+    def _modified_at(self) -> float:
         try:
             return self._path.lstat().st_mtime
         except OSError:
             return 0.0
 
-    def _sync(self) -> None:
+    def _sync_folder(self) -> None:
         handle = os.open(self._folder, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -168,47 +163,49 @@ class DiskStopStore(StopStore):
 
 
 class StopRecorder:
-    """Keeps a stop through a restart; whatever fails in that is words.
+    """Stores a stop; failures become sentences and an alert.
 
-    :param alert: tells a person
+    :param alert: receives the alert while a stop is not stored
     """
 
-    def __init__(self, latch: StopStore, alert: OnAlert) -> None:
-        self.unkept = ""
-        """Why the stop is not known to be on the disk; empty where it is."""
-        self._latch = latch
-        self._unlatched = AlertCondition(alert, "stop", "record")
-        self._log = Logger("helm")
+    def __init__(self, store: StopStore, alert: OnAlert) -> None:
+        self.problem = ""
+        """Sentence that says why the stop may not be on the disk; empty: it is."""
+        self._store = store
+        self._alert_condition = AlertCondition(alert, "stop", "record")
+        self._log = Logger("motion")
 
-    def keep(self, stopped: link.Stopped) -> None:
-        """Keep it; :attr:`unkept` says whether that was in vain."""
-        self.unkept = ""
+    def store(self, stopped: link.Stopped) -> None:
+        """Store a stop; :attr:`problem` says whether that failed."""
+        self.problem = ""
         try:
-            self._latch.keep(stopped)
+            self._store.store(stopped)
         except Unavailable as error:
-            self.unkept = str(error)
-        except Exception:  # the rest of the stop must not hang on it
-            self._log.failure("a stop could not be kept")
-            self.unkept = "the stop can't be kept through a restart; the robot's log says why"
-        self._unlatched.tell(but([self.unkept] if self.unkept else []), "the stop is kept through a restart")
+            self.problem = str(error)
+        except Exception:  # the other parts of a stop must not depend on it
+            self._log.failure("a stop could not be stored")
+            self.problem = "the stop can't be stored for the next start; the robot's log says why"
+        self._alert_condition.update(
+            stopped_but([self.problem] if self.problem else []), "the stop is stored for the next start"
+        )
 
     def clear(self) -> list[str]:
-        """Take the record away; what went wrong, in words: it may be there or not."""
+        """Remove the record; return sentences about what went wrong: then it may or may not be there."""
         try:
-            self._latch.clear()
+            self._store.clear()
         except Unavailable as error:
             return [str(error)]
         except Exception:
-            self._log.failure("the record of a stop could not be taken away")
-            return ["the record of the stop can't be taken away; the robot's log says why"]
+            self._log.failure("the record of a stop could not be removed")
+            return ["the record of the stop can't be removed; the robot's log says why"]
         return []
 
     def end(self) -> None:
-        """The robot is resumed."""
-        self.unkept = ""
-        self._unlatched.tell("", "the robot is resumed")
+        """End the alert, as the robot is resumed."""
+        self.problem = ""
+        self._alert_condition.update("", "the robot is resumed")
 
 
-def but(problems: list[str]) -> str:
-    """What is told of a stop with which something is wrong; empty for nothing."""
+def stopped_but(problems: list[str]) -> str:
+    """The sentence about a stop with problems; empty where there are none."""
     return f"the robot is stopped, but {'; '.join(problems)}" if problems else ""

@@ -1,4 +1,4 @@
-"""A topic with its type, which together say what a publisher of zero must be."""
+"""A topic with its type, which together determine a publisher of zero."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 
 class TypedTopic(NamedTuple):
-    """A topic as the platform knows it: absolute name, full type name."""
+    """A topic as the platform resolved it: absolute name, full type name."""
 
-    topic: str
+    name: str
     type: str
 
     def __str__(self) -> str:
-        return f"{self.topic} ({self.type})"
+        return f"{self.name} ({self.type})"

@@ -1,8 +1,8 @@
-"""The speeds in a motion command, read and written in place. Pure: bytes in, bytes out.
+"""Reads and writes the speeds in a motion command in place. Pure: bytes in, bytes out.
 
-A type whose speeds stand somewhere known has a :class:`VelocityAccess` here. The offsets of CDR follow from the types'
-definitions (``geometry_msgs/Twist``: six doubles; ``TwistStamped``: a header before them) and from the alignment of
-doubles to 8 bytes behind the encapsulation (DDSI-RTPS 2.2, section 10).
+Each supported type has a :class:`VelocityAccess`. CDR offsets follow from the types' definitions
+(``geometry_msgs/Twist``: six doubles; ``TwistStamped``: a header before them). Doubles are aligned to 8 bytes, counted
+from the end of the encapsulation header (DDSI-RTPS 2.2, section 10).
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
 Vector = tuple[float, float, float]
 
-_HEAD = 4
-"""Bytes of the encapsulation; what follows is aligned from behind it."""
-_STAMP = 8
-_SIZE = 48
-_SIX = (struct.Struct(">6d"), struct.Struct("<6d"))
+_ENCAPSULATION = 4
+"""Bytes of the encapsulation header; alignment counts from its end."""
+_STAMP_SIZE = 8
+_SPEEDS_SIZE = 48
+_SIX_DOUBLES = (struct.Struct(">6d"), struct.Struct("<6d"))
 _LENGTH = (struct.Struct(">I"), struct.Struct("<I"))
 _AXES = ("x", "y", "z")
 
 
 class Velocity(NamedTuple):
-    """What a command asks for: metres per second and radians per second, each along x, y and z."""
+    """Commanded velocity: linear in metres per second, angular in radians per second, each along x, y and z."""
 
     linear: Vector
     angular: Vector
 
     @property
     def finite(self) -> bool:
-        """Whether all of it are numbers that a robot could follow."""
+        """Whether no component is infinite or NaN."""
         return all(map(math.isfinite, self.linear)) and all(map(math.isfinite, self.angular))
 
     @property
     def moves(self) -> bool:
-        """Whether any of it is not zero."""
+        """Whether any component is not zero."""
         return any(self.linear) or any(self.angular)
 
     def times(self, share: float) -> Velocity:
-        """The same in all directions, at a share of the speed."""
+        """Scale all components by ``share``."""
         return Velocity(scaled(self.linear, share), scaled(self.angular, share))
 
 
@@ -52,34 +52,34 @@ STILL = Velocity((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 def scaled(vector: Vector, share: float) -> Vector:
-    """A vector of the same direction, at a share of the length."""
+    """Scale a vector by ``share``."""
     x, y, z = vector
     return (x * share, y * share, z * share)
 
 
 class VelocityAccess(Protocol):
-    """How the speeds stand in commands of one type."""
+    """Access to the speeds in commands of one type and encoding."""
 
     def read(self, body: bytes) -> Velocity | None:
-        """The speeds of a command; ``None`` where it isn't written as it should be."""
+        """The speeds of a command; ``None``: it is malformed."""
 
     def write(self, body: bytes, velocity: Velocity) -> bytes:
-        """The same command with other speeds; ``body`` is one that :meth:`read` understands."""
+        """The same command with other speeds; ``body`` must be readable by :meth:`read`."""
 
 
-def form(type: str, encoding: str) -> VelocityAccess | None:
-    """How commands of this type hold their speeds, ``None`` where that is not known.
+def velocity_access(type: str, encoding: str) -> VelocityAccess | None:
+    """Access to the speeds of a type; ``None``: it is not supported.
 
     :param type: full name of the message type
     :param encoding: ``cdr`` or ``json``
     """
-    return _FORMS.get((type, encoding))
+    return _ACCESS.get((type, encoding))
 
 
-class _Cdr:
-    """Plain CDR of version 1, in either byte order.
+class _CdrAccess:
+    """Plain CDR version 1, in either byte order.
 
-    :param stamped: whether a header stands before the speeds
+    :param stamped: whether a ``std_msgs/Header`` precedes the speeds
     """
 
     def __init__(self, stamped: bool) -> None:
@@ -89,33 +89,33 @@ class _Cdr:
         start = self._start(body)
         if start is None:
             return None
-        x, y, z, roll, pitch, yaw = _SIX[body[1]].unpack_from(body, start)
+        x, y, z, roll, pitch, yaw = _SIX_DOUBLES[body[1]].unpack_from(body, start)
         return Velocity((x, y, z), (roll, pitch, yaw))
 
     def write(self, body: bytes, velocity: Velocity) -> bytes:
         start = self._start(body)
         if start is None:
             raise ValueError("the command does not hold its speeds where they should be")
-        made = bytearray(body)
-        _SIX[body[1]].pack_into(made, start, *velocity.linear, *velocity.angular)
-        return bytes(made)
+        changed = bytearray(body)
+        _SIX_DOUBLES[body[1]].pack_into(changed, start, *velocity.linear, *velocity.angular)
+        return bytes(changed)
 
     def _start(self, body: bytes) -> int | None:
-        """Where the first of the six doubles is. What is behind the last is no part of the message."""
-        if len(body) < _HEAD + _SIZE or body[0] or body[1] > 1:
+        """Offset of the first of the six doubles; ``None``: malformed, or bytes follow the last double."""
+        if len(body) < _ENCAPSULATION + _SPEEDS_SIZE or body[0] or body[1] > 1:
             return None
-        start = _HEAD
+        start = _ENCAPSULATION
         if self._stamped:
-            (length,) = _LENGTH[body[1]].unpack_from(body, _HEAD + _STAMP)
-            start += _STAMP + 4 + length
-            start += (_HEAD - start) % 8
-        return start if start + _SIZE == len(body) else None
+            (length,) = _LENGTH[body[1]].unpack_from(body, _ENCAPSULATION + _STAMP_SIZE)
+            start += _STAMP_SIZE + 4 + length
+            start += (_ENCAPSULATION - start) % 8
+        return start if start + _SPEEDS_SIZE == len(body) else None
 
 
-class _Json:
-    """An object of objects; a number that is left out is 0.
+class _JsonAccess:
+    """A JSON object of objects; a missing number is 0.
 
-    :param stamped: whether the speeds are below ``twist``
+    :param stamped: whether the speeds are in the member ``twist``
     """
 
     def __init__(self, stamped: bool) -> None:
@@ -150,9 +150,9 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-_FORMS: dict[tuple[str, str], VelocityAccess] = {
-    (TWIST, "cdr"): _Cdr(stamped=False),
-    (TWIST_STAMPED, "cdr"): _Cdr(stamped=True),
-    (TWIST, "json"): _Json(stamped=False),
-    (TWIST_STAMPED, "json"): _Json(stamped=True),
+_ACCESS: dict[tuple[str, str], VelocityAccess] = {
+    (TWIST, "cdr"): _CdrAccess(stamped=False),
+    (TWIST_STAMPED, "cdr"): _CdrAccess(stamped=True),
+    (TWIST, "json"): _JsonAccess(stamped=False),
+    (TWIST_STAMPED, "json"): _JsonAccess(stamped=True),
 }

@@ -1,7 +1,8 @@
-"""What a robot platform offers to the daemon: ROS 2 is one, memory another.
+"""The interface between the daemon and a robot's middleware; ``ros2/`` and ``mqtt/`` implement it.
 
-All methods are called on the reactor's thread, all callbacks come there. Requests that can't be done raise
-one of :mod:`relay_protocol.errors` with a sentence for the client.
+All methods are called on the reactor's thread, and all callbacks run there. A request that can't be carried
+out raises one of :mod:`relay_protocol.errors`; its text is for the client. Message bodies are bytes in
+:attr:`Platform.encoding`.
 """
 
 from __future__ import annotations
@@ -20,22 +21,26 @@ from robot_client.motion.typed_topic import TypedTopic
 OnSample = Callable[[bytes], None]
 OnChange = Callable[[], None]
 Check = Callable[[], None]
-"""Sees that something may still be done; raises one of :mod:`relay_protocol.errors` where it may not."""
+"""Called right before a request is sent; raises one of :mod:`relay_protocol.errors` if it must not be
+sent."""
 
 OnCall = Callable[[bytes, Callable[[bytes], None]], None]
-"""Takes a request and what its answer is to be given to, which raises :class:`Invalid` for bytes that are none."""
+"""Takes a request and a callable for the response, which raises :class:`Invalid` for bytes that are no response."""
 
-NEVER_BEGAN = 0
+OnLatched = Callable[[int, bytes], None]
+"""Takes the stamp and the body of a sample that a publisher keeps for late joiners."""
+
+NOT_STARTED = 0
 SUCCEEDED = 4
 CANCELED = 5
 ABORTED = 6
-"""How a goal ended, as in ``action_msgs/msg/GoalStatus``."""
+"""End states of a goal, as in ``action_msgs/msg/GoalStatus``; ``NOT_STARTED`` is its ``STATUS_UNKNOWN``."""
 
 Entry = TypeVar("Entry", link.Topic, link.Service)
 
 
 class Facts(NamedTuple):
-    """What a platform knows of itself, for ``describe``."""
+    """Description of a platform, for the ``describe`` message."""
 
     platform: str
     distro: str = ""
@@ -52,88 +57,95 @@ class GraphView(msgspec.Struct, frozen=True, kw_only=True):
     nodes: frozenset[str] = frozenset()
 
 
-class Motion(enum.Enum):
-    """What a command would do."""
+class CommandEffect(enum.Enum):
+    """The effect of a command on the robot."""
 
     STILL = "still"
     MOVING = "moving"
     INVALID = "invalid"
-    """No message of its type, or with a number that is none (NaN, infinity)."""
+    """The bytes are no message of the type, or a number in it is NaN or infinite."""
 
 
-OnKept = Callable[[int, bytes], None]
-"""Takes the stamp and the body of a sample that a publisher keeps."""
+OnDropped = Callable[[int], None]
+"""Called with the number of samples that were dropped before they reached the reactor."""
 
 
 class SubscriptionHandle(Protocol):
-    """A topic the daemon listens to."""
+    """A subscription of the daemon."""
 
     type: str
+    on_dropped: OnDropped
     unmatched: list[str]
-    """Nodes that publish it and are not heard, because they offer less than was asked for; with the reason."""
+    """Publishers whose quality of service is too weak for this subscription to receive them: node, reason."""
     stamp: int
-    """Of the sample that is being passed on: nanoseconds since 1970 when it first came, 0 when nobody noted it."""
+    """When the sample that is being passed on first arrived, nanoseconds since 1970; 0 if that was not
+    recorded."""
 
     @property
-    def replays(self) -> str:
-        """Names the memory of stamps: under the same name a stamp means the same sample. Empty: no :meth:`recall`."""
+    def stamps_id(self) -> str:
+        """Id of the record of stamps: under the same id a stamp means the same sample. Empty: no latched
+        samples can be requested again.
+        """
 
     @property
     def latched(self) -> bool:
-        """Whether its publishers keep their last messages for late joiners."""
+        """Whether a publisher keeps its last messages for late joiners (transient local)."""
 
     @property
     def publishers(self) -> int:
-        """How many publish now."""
+        """Number of publishers now."""
 
-    def recall(self, on_kept: OnKept, on_end: Callable[[], None]) -> None:
-        """Ask the publishers for what they keep for late joiners; ends what was asked before.
+    def request_latched(self, on_latched: OnLatched, on_end: Callable[[], None]) -> None:
+        """Fetch the samples that publishers keep for late joiners. A running request ends first.
 
-        :param on_kept: called with each of these samples, also with those passed on before, and with what is published
-            meanwhile
-        :param on_end: called once, when all have had time to come; not when the source is closed before
+        :param on_latched: called with each of these samples, with those passed on before, and with samples
+            that are published meanwhile
+        :param on_end: called once, when all have had time to arrive; not if the subscription is closed
+            earlier
         """
 
     def close(self) -> None:
-        """Stop listening; no sample comes any more."""
+        """End the subscription; no callback runs after this."""
 
 
 class PublisherHandle(Protocol):
-    """A topic the daemon publishes."""
+    """A publisher of the daemon."""
 
     unmatched: list[str]
-    """Nodes that subscribe to it and get nothing, because they ask for more than is offered; with the reason."""
+    """Subscribers that request a stronger quality of service than is offered, and receive nothing: node,
+    reason."""
 
     def publish(self, body: bytes) -> None:
-        """Publish one message in the platform's encoding."""
+        """Publish one message."""
 
     def close(self) -> None:
-        """Take the publisher away."""
+        """Remove the publisher."""
 
 
 class AdvertisementHandle(Protocol):
-    """A service or action the daemon offers."""
+    """A service or action that the daemon advertises in the robot's graph."""
 
     type: str
 
     def close(self) -> None:
-        """Offer it no more: calls get no answer, goals are aborted."""
+        """Withdraw it: open calls get no response, open goals are aborted."""
 
 
 class ServedGoal(Protocol):
-    """A goal from the graph that somebody at the relay pursues."""
+    """A goal from the robot's graph that a client of the relay executes."""
 
     def feedback(self, body: bytes) -> None:
-        """Publish how far it has come.
+        """Publish feedback.
 
         :raises Invalid: the bytes are no feedback of the action's type
         """
 
     def finish(self, status: int, body: bytes | None) -> None:
-        """End it; what is neither :data:`SUCCEEDED` nor a :data:`CANCELED` that was asked for is an abort.
+        """End the goal. Any status but :data:`SUCCEEDED`, or :data:`CANCELED` after a cancel request,
+        aborts it.
 
         :param body: the result, ``None`` for an empty one
-        :raises Invalid: the bytes are no result of the action's type; the goal goes on
+        :raises Invalid: the bytes are no result of the action's type; the goal stays open
         """
 
 
@@ -142,12 +154,12 @@ OnCancel = Callable[[ServedGoal], None]
 
 
 class GoalOutcome(NamedTuple):
-    """How a goal of ours ended.
+    """The end of a goal that the daemon sent.
 
-    :param status: one of the four above
+    :param status: :data:`NOT_STARTED`, :data:`SUCCEEDED`, :data:`CANCELED` or :data:`ABORTED`
     :param body: the result, ``None`` if there is none
-    :param reason: why there is none
-    :param certain: whether the action has ended it, or never got it; else it may go on though nobody hears of it
+    :param reason: why there is no result
+    :param certain: whether the action has ended the goal or never got it; if not, it may still be executing
     """
 
     status: int
@@ -157,66 +169,79 @@ class GoalOutcome(NamedTuple):
 
 
 class GoalHandle(Protocol):
-    """A goal that an action of the robot pursues for us."""
+    """A goal that the daemon sent to an action of the robot."""
 
     id: bytes
-    """What the action knows it by, 16 bytes."""
+    """The goal's UUID, 16 bytes."""
     result: Deferred[GoalOutcome]
-    """Fires once in every case."""
+    """Fires exactly once; never fails."""
 
     def cancel(self) -> None:
-        """Want it no more, however far it is; :attr:`result` still comes. An action that was asked is asked again."""
+        """Request cancellation at any stage; :attr:`result` still fires. Calling it again repeats the
+        request."""
 
 
 class Platform(Protocol):
     """One robot's middleware."""
 
     encoding: str
+    """Encoding of message bodies, such as ``cdr``."""
     on_alert: OnAlert
-    """Is told what a person should know."""
+    """Receives alerts of the platform."""
 
     @property
     def dropped(self) -> int:
-        """Samples that never reached the reactor, since start."""
+        """Samples since the start that were discarded before they reached the reactor."""
 
     def start(self) -> None:
         """Connect to the middleware.
 
-        :raises Unavailable: it is not there, in words
+        :raises Unavailable: it can't be reached
         """
 
     def stop(self) -> None:
-        """Leave it; every source and sink is closed."""
+        """Disconnect; all subscriptions and publishers are closed."""
 
     def facts(self) -> Facts:
-        """What it is."""
+        """Description of the platform."""
 
     def graph(self) -> GraphView:
-        """What there is now."""
+        """The graph now."""
+
+    def endpoints(self, name: str, kind: str) -> frozenset[bytes]:
+        """Ids of the publishers of a topic or the servers of a service, without the daemon's own.
+
+        A process that is started again has other ids. The middleware may list endpoints of a killed process for
+        a while: DDS usually for 20 s.
+
+        :param kind: ``topic`` or ``service``
+        :raises Invalid: not a valid name
+        """
 
     def subscribe(
         self, topic: str, type: str, qos: link.QoS | None, on_sample: OnSample, on_change: OnChange
     ) -> SubscriptionHandle:
-        """Listen to a topic, present or not yet.
+        """Subscribe to a topic, which need not exist yet.
 
-        :param type: empty to take the topic's one type from the graph
-        :param on_change: called when :attr:`SubscriptionHandle.latched`, ``publishers`` or ``unmatched`` changed
+        :param type: empty to take the topic's only type from the graph
+        :param on_change: called when :attr:`SubscriptionHandle.latched`, ``publishers`` or ``unmatched``
+            changed
         """
 
     def after_samples(self, call: Callable[[], None]) -> None:
-        """Call once when the samples that came together have all been passed on."""
+        """Call once, when all samples that arrived together have been passed on."""
 
     def resolve(self, topic: str, type: str) -> TypedTopic:
-        """Name and type that :meth:`advertise` would use, however they are spelled.
+        """The full name and type that :meth:`advertise` would use.
 
-        :param type: empty to take the topic's one type from the graph
+        :param type: empty to take the topic's only type from the graph
         """
 
-    def full_name(self, name: str, what: str) -> str:
-        """The absolute name that is used in the end, however it is spelled.
+    def full_name(self, name: str, kind: str) -> str:
+        """The absolute name after remapping.
 
-        :param what: ``topic``, ``service`` or ``action``
-        :raises Invalid: it is no name
+        :param kind: ``topic``, ``service`` or ``action``
+        :raises Invalid: not a valid name
         """
 
     def advertise(
@@ -228,82 +253,88 @@ class Platform(Protocol):
         queue_size: int = 0,
         on_change: OnChange = lambda: None,
     ) -> PublisherHandle:
-        """Make a publisher. What ``qos`` leaves out follows what the topic's subscribers ask for.
+        """Create a publisher. Policies that ``qos`` leaves out follow the requests of the topic's subscribers.
 
-        :param queue_size: messages kept for subscribers that are slow, unless ``qos`` says it; the usual below 1
+        :param queue_size: messages kept for slow subscribers, unless ``qos`` gives a depth; below 1: the
+            default
         :param on_change: called when :attr:`PublisherHandle.unmatched` changed
         """
 
     def call(
         self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None
     ) -> Deferred[bytes]:
-        """Call a service once; fails with a sentence. Cancelling the result gives the call up.
+        """Call a service once. Cancelling the Deferred gives up the call.
 
-        :param check: called on the reactor's thread right before the request is sent, when the service is found; the
-            call fails with what it raises, and nothing is sent
+        :param timeout: seconds
+        :param check: called on the reactor's thread right before the request is sent, when the service has
+            been found; if it raises, nothing is sent and the call fails with that error
         """
 
     def prepare_call(self, service: str, type: str) -> None:
-        """Keep for good what calls a service, so that it need not be found again when it is called by this type."""
+        """Keep a client of this service open, so that later calls with this type need not discover the
+        service."""
 
-    def serve(self, service: str, type: str, on_call: OnCall) -> AdvertisementHandle:
-        """Offer a service; its calls come one after the other and are answered in any order."""
+    def advertise_service(self, service: str, type: str, on_call: OnCall) -> AdvertisementHandle:
+        """Advertise a service; its calls arrive one after the other and may be answered in any order."""
 
-    def act(self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel) -> AdvertisementHandle:
-        """Offer an action; every goal is accepted.
+    def advertise_action(
+        self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel
+    ) -> AdvertisementHandle:
+        """Advertise an action; every goal is accepted.
 
-        :param on_cancel: told of a goal nobody wants any more
+        :param on_cancel: called with each goal that is to be cancelled
         """
 
-    def pursue(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> GoalHandle:
-        """Have an action of the robot pursue a goal.
+    def send_goal(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> GoalHandle:
+        """Send a goal to an action of the robot.
 
-        :param type: empty to take the action's one type from the graph
-        :param on_feedback: ``None`` when nobody wants to know
+        :param type: empty to take the action's only type from the graph
+        :param on_feedback: ``None`` if no feedback is needed
         """
 
     def definition(self, type: str) -> link.TypeDefinition:
-        """The text of a type and all it contains."""
+        """The text of a type and of all types it contains."""
 
     def interfaces(self) -> list[str]:
         """Full names of all types that :meth:`definition` knows, sorted."""
 
-    def judge(self, type: str, body: bytes) -> Motion:
-        """What this command would do."""
+    def classify_command(self, type: str, body: bytes) -> CommandEffect:
+        """Whether a command moves the robot."""
 
-    def resting(self, type: str, body: bytes) -> bytes:
-        """What the zero that follows this command is like: as many axes, the same joints; empty where all are alike.
+    def zero_template(self, type: str, body: bytes) -> bytes:
+        """The shape of the zero command that may follow this command: as many axes, the same joints. Empty
+        for types whose messages all have one shape.
 
-        :param body: a command that was judged, and found valid
+        :param body: a command that :meth:`classify_command` found valid
         """
 
-    def zero(self, type: str, rest: bytes = b"") -> bytes:
-        """The message of this type that stands still, stamped now where it has a header.
+    def zero_command(self, type: str, template: bytes = b"") -> bytes:
+        """A command of this type that means standstill, stamped with the current time if it has a header.
 
-        :param rest: what :meth:`resting` gave for the command it follows
+        :param template: from :meth:`zero_template` of the command it follows
         """
 
     def battery(self) -> float | None:
-        """Charge, 0 to 1, where known."""
+        """Charge, 0 to 1; ``None`` if unknown."""
 
-    def trouble(self) -> str | None:
-        """A sentence when the middleware is stuck, else ``None``."""
+    def fault(self) -> str | None:
+        """A sentence that says why the middleware no longer works; ``None``: it works."""
 
 
-def difference(old: GraphView, new: GraphView) -> link.Graph | None:
-    """What changed between two views, as a message; ``None`` if nothing did."""
+def graph_changes(old: GraphView, new: GraphView) -> link.Graph | None:
+    """The changes between two views as a message; ``None`` if there are none."""
     nodes: dict[str, dict[str, object] | None] = {name: {} for name in new.nodes - old.nodes}
     nodes.update(dict.fromkeys(old.nodes - new.nodes))
     changes = link.Graph(
-        topics=_changed(old.topics, new.topics),
-        services=_changed(old.services, new.services),
-        actions=_changed(old.actions, new.actions),
+        topics=_changed_entries(old.topics, new.topics),
+        services=_changed_entries(old.services, new.services),
+        actions=_changed_entries(old.actions, new.actions),
         nodes=nodes,
     )
     return changes if changes.topics or changes.services or changes.actions or changes.nodes else None
 
 
-def whole(view: GraphView) -> link.Graph:
+def full_graph(view: GraphView) -> link.Graph:
     """A view as a full ``graph`` message."""
     return link.Graph(
         full=True,
@@ -314,7 +345,7 @@ def whole(view: GraphView) -> link.Graph:
     )
 
 
-def _changed(old: dict[str, Entry], new: dict[str, Entry]) -> dict[str, Entry | None]:
+def _changed_entries(old: dict[str, Entry], new: dict[str, Entry]) -> dict[str, Entry | None]:
     changed: dict[str, Entry | None] = {name: entry for name, entry in new.items() if old.get(name) != entry}
     changed.update(dict.fromkeys(old.keys() - new.keys()))
     return changed

@@ -1,6 +1,6 @@
-"""The text of ROS 2 interfaces with every type they contain, in the layout of rosbag2's ``ros2msg``.
+"""Definition texts of ROS 2 interfaces with all types they contain, in the layout of rosbag2's ``ros2msg``.
 
-Texts come from the ``.msg``, ``.srv`` and ``.action`` files under ``share/``; no ROS is imported here.
+They are read from the ``.msg``, ``.srv`` and ``.action`` files under ``share/``; no ROS is imported here.
 """
 
 from __future__ import annotations
@@ -45,18 +45,19 @@ Lookup = Callable[[str], str | None]
 def normalise(name: str, kind: str = "msg") -> str:
     """A type's full name: ``std_msgs/String`` is short for ``std_msgs/msg/String``.
 
-    :param kind: ``msg``, ``srv`` or ``action``, what a short name means
-    :raises Invalid: no type name
+    :param kind: ``msg``, ``srv`` or ``action``, the meaning of a short name
+    :raises Invalid: not a type name
     """
     if name.count("/") == 1:
         name = name.replace("/", f"/{kind}/")
     if not _TYPE_NAME.match(name):
-        raise Invalid(f"'{name}' is no type; write package/{kind}/Name")
+        raise Invalid(f"'{name}' is not a type; write package/{kind}/Name")
     return name
 
 
 def prefixes() -> list[Path]:
-    """Where interfaces may be installed: each ``AMENT_PREFIX_PATH``, then where Python's own packages are."""
+    """Prefixes where interfaces may be installed: those in ``AMENT_PREFIX_PATH``, then those of Python's
+    packages."""
     found = [Path(each) for each in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if each]
     found.append(Path(sys.prefix))
     for entry in sys.path:
@@ -68,10 +69,10 @@ def prefixes() -> list[Path]:
 
 
 def all_names(where: Iterable[Path]) -> list[str]:
-    """Full names of all types that are installed, sorted, at most as many as can be told.
+    """Full names of all installed types, sorted, as many as fit into a message.
 
-    The resource index of ament names the types of a package too of which only Python knows the fields; a package
-    that is not in the index is found by its files.
+    ament's resource index also has types without definition files; a package that is not in the index is
+    found by its files.
     """
     found: set[str] = set()
     for prefix in where:
@@ -83,7 +84,7 @@ def all_names(where: Iterable[Path]) -> list[str]:
     names = {name.rpartition(".")[0] for name in found if name.endswith((".msg", ".srv", ".action", ".idl"))}
     known = sorted(name for name in names if len(name) <= NAME and _TYPE_NAME.match(name))
     room = JSON_BODY - KIB
-    # Each takes its length, quotes and a comma; a longer message would cost the link.
+    # Each needs its length, quotes and a comma; a longer message would close the link.
     sizes = accumulate(len(name) + 3 for name in known)
     return [name for name, size in zip(known, sizes, strict=True) if size <= room][:INTERFACES]
 
@@ -96,16 +97,16 @@ def _read_lines(path: Path) -> list[str]:
 
 
 def installed(name: str, where: Iterable[Path], suffix: str = "") -> str | None:
-    """The content of a type's file, ``None`` if there is none.
+    """Content of a type's file; ``None`` if there is none.
 
     :param name: full type name
-    :param suffix: ``.json`` for the description with the hashes, empty for the text
+    :param suffix: ``.json`` for the description with the hashes, empty for the definition
     """
     package, kind, short = name.split("/")
     for prefix in where:
         path = prefix / "share" / package / kind / (short + (suffix or "." + kind))
         try:
-            # As rosidl tells lines apart: a form feed ends one too. In a text that is sent only a line feed does.
+            # As in rosidl, a form feed ends a line too. In the texts that are sent only a line feed does.
             return "".join(f"{line}\n" for line in path.read_text(encoding="utf-8").splitlines())
         except (OSError, UnicodeDecodeError):
             continue
@@ -113,7 +114,7 @@ def installed(name: str, where: Iterable[Path], suffix: str = "") -> str | None:
 
 
 def type_hash(name: str, where: Iterable[Path]) -> str:
-    """The RIHS01 hash a distribution wrote beside the type; empty if it has none."""
+    """The RIHS01 hash that the distribution installed beside the type; empty if there is none."""
     text = installed(name, where, ".json")
     if text is None:
         return ""
@@ -125,20 +126,20 @@ def type_hash(name: str, where: Iterable[Path]) -> str:
 
 
 def full_text(name: str, lookup: Lookup) -> str:
-    """A type's text, then each type it contains after a rule and ``MSG: package/Name``.
+    """A type's text, followed by each type it contains after a rule and ``MSG: package/Name``.
 
-    :param lookup: gives the text of one type by its full name
+    :param lookup: returns the text of one type by its full name
     :raises NotFound: the type, or one it contains, is not installed
-    :raises Invalid: all together are too large to send
+    :raises Invalid: the whole text is too large to send
     """
     main = lookup(name)
     if main is None:
         raise NotFound(f"the type {name} is not installed on this robot")
     parts = [main.rstrip("\n") + "\n"]
     known = {name}
-    waiting = contained(main, name.split("/")[0], lookup)
-    while waiting:
-        each = waiting.pop(0)
+    pending = contained(main, name.split("/")[0], lookup)
+    while pending:
+        each = pending.pop(0)
         if each in known:
             continue
         known.add(each)
@@ -147,7 +148,7 @@ def full_text(name: str, lookup: Lookup) -> str:
             raise NotFound(f"{name} contains {each}, which is not installed on this robot")
         package, _, short = each.split("/")
         parts.append(f"{RULE}\nMSG: {package}/{short}\n{text.rstrip(chr(10))}\n")
-        waiting += contained(text, package, lookup)
+        pending += contained(text, package, lookup)
     whole = "".join(parts)
     if len(whole.encode()) > TYPE_DEFINITION:
         raise Invalid(f"the definition of {name} is larger than {TYPE_DEFINITION} bytes")
@@ -155,7 +156,7 @@ def full_text(name: str, lookup: Lookup) -> str:
 
 
 def contained(text: str, package: str, lookup: Lookup) -> list[str]:
-    """Full names of the messages a text has fields of, in order.
+    """Full names of the messages that are types of fields, in order.
 
     :param package: of the text
     :param lookup: as in :func:`full_text`
@@ -174,5 +175,5 @@ def _full(name: str, package: str, lookup: Lookup) -> str:
     if len(parts) > 1:
         return f"{parts[0]}/msg/{parts[-1]}"
     own = f"{package}/msg/{name}"
-    # As in rosidl a name alone is of the same package. ROS 1 had one exception, which is still written.
+    # As in rosidl, a name without package is of the same package. ROS 1 had one exception, which is still in use.
     return "std_msgs/msg/Header" if name == "Header" and lookup(own) is None else own

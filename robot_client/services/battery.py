@@ -1,4 +1,4 @@
-"""Charge of a battery: as Linux tells it of its own, and what is to be said of it. Pure but for reading files."""
+"""State of a battery, as Linux reports it, and its diagnostics."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from relay_protocol.errors import Unavailable
-from relay_protocol.text import inert
+from relay_protocol.text import escape_unprintable
 from robot_client.services.health import Level, ServiceFinding
 
 SUPPLIES = Path("/sys/class/power_supply")
 
 LONGEST = 256
-"""Bytes that are read of a file; the kernel's hold a word or a number."""
+"""Most bytes read of a file; the kernel's files hold a word or a number."""
 RECOVERY = 0.02
-"""Share of the charge by which it must be above a threshold again before that is over."""
+"""Hysteresis of the thresholds, as fraction of the charge."""
 
 STATUS = {"Charging": 1, "Discharging": 2, "Not charging": 3, "Full": 4}
 HEALTH = {
@@ -30,21 +30,21 @@ HEALTH = {
     "Safety timer expire": 8,
 }
 TECHNOLOGY = {"NiMH": 1, "Li-ion": 2, "Li-poly": 3, "LiFe": 4, "NiCd": 5, "LiMn": 6}
-"""Words of the kernel (Documentation/ABI/testing/sysfs-class-power) as numbers of sensor_msgs/BatteryState."""
+"""States of the kernel (Documentation/ABI/testing/sysfs-class-power) as numbers of sensor_msgs/BatteryState."""
 
 CHARGING, FULL = STATUS["Charging"], STATUS["Full"]
 _GOOD = (0, HEALTH["Good"])
 
 
 class ChargeState(NamedTuple):
-    """A battery, in the units of sensor_msgs/BatteryState. What isn't known is NaN.
+    """A battery, in the units of sensor_msgs/BatteryState. Unknown values are NaN.
 
-    :ivar volts: at its poles
-    :ivar amperes: less than zero when it is drained
-    :ivar celsius: its temperature
+    :ivar volts: voltage
+    :ivar amperes: negative while discharging
+    :ivar celsius: temperature
     :ivar charge: Ah left
-    :ivar capacity: Ah when full now
-    :ivar design: Ah when full once
+    :ivar capacity: Ah when full, now
+    :ivar design: Ah when full, by design
     :ivar share: charge, 0 to 1
     """
 
@@ -63,9 +63,9 @@ class ChargeState(NamedTuple):
 
 
 def supply(folder: Path) -> Path:
-    """The first battery of the machine among the folders of its power supplies.
+    """The folder of the machine's first battery.
 
-    Batteries of mice and keyboards (``scope`` is ``Device``) don't count.
+    Batteries of mice and keyboards (``scope`` is ``Device``) are ignored.
 
     :param folder: :data:`SUPPLIES`, or one battery's own folder, which is taken as it is
     :raises Unavailable: there is none
@@ -82,7 +82,7 @@ def supply(folder: Path) -> Path:
     raise Unavailable(f"there is no battery in {folder}")
 
 
-_WANTED = (
+_FILES = (
     "type",
     "scope",
     "present",
@@ -106,21 +106,21 @@ _WANTED = (
 
 
 def read(folder: Path) -> dict[str, str]:
-    """The files of one power supply, as far as it has them."""
+    """Read the existing files of one power supply."""
     facts = {}
-    for name in _WANTED:
+    for name in _FILES:
         try:
             with (folder / name).open("rb") as file:
                 text = file.read(LONGEST).decode("ascii", "replace").strip()
         except OSError:  # not there, or the hardware doesn't answer now
             continue
         if text:
-            facts[name] = inert(text)
+            facts[name] = escape_unprintable(text)
     return facts
 
 
-def of_facts(facts: Mapping[str, str]) -> ChargeState:
-    """What the files of a power supply tell; they count in millionths, and in tenths of a degree."""
+def parse_facts(facts: Mapping[str, str]) -> ChargeState:
+    """Parse the files of a power supply, which hold millionths and tenths of a degree."""
     volts = _number(facts, "voltage_now") / 1e6
     amperes = _number(facts, "current_now") / 1e6
     if math.isnan(amperes):
@@ -154,7 +154,7 @@ def _ampere_hours(facts: Mapping[str, str], which: str, volts: float) -> float:
     charge = _number(facts, f"charge_{which}") / 1e6
     if math.isfinite(charge):
         return charge
-    # Some count energy; by the design's voltage it is charge.
+    # Some report energy; divided by the design voltage it is charge.
     design = _number(facts, "voltage_min_design") / 1e6
     return _quotient(_number(facts, f"energy_{which}") / 1e6, design if math.isfinite(design) else volts)
 
@@ -171,11 +171,11 @@ def _quotient(value: float, by: float) -> float:
 
 
 class Gauge:
-    """How full a battery is, for batteries that don't say it too, and what is to be said of it.
+    """Computes the charge of a battery, also from its voltage, and its diagnostics.
 
-    :param low: share at which it is low
-    :param critical: share at which it is nearly empty
-    :param volts: when empty and when full; zero when nobody knows
+    :param low: charge, 0 to 1, below which it is low
+    :param critical: charge below which it is nearly empty
+    :param volts: when empty and when full; zero when unknown
     """
 
     def __init__(self, low: float, critical: float, volts: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -184,7 +184,7 @@ class Gauge:
         self._level = Level.OK
 
     def share(self, state: ChargeState) -> float:
-        """Charge from 0 to 1: as the battery says, from its capacity, or from its voltage; NaN when none is known."""
+        """Charge from 0 to 1, as reported, or from capacity or voltage; NaN when unknown."""
         if 0.0 <= state.share <= 1.0:
             return state.share
         found = _quotient(state.charge, state.capacity)
@@ -194,30 +194,30 @@ class Gauge:
         return found if math.isnan(found) else min(1.0, max(0.0, found))
 
     def finding(self, state: ChargeState) -> ServiceFinding:
-        """What is said of it."""
+        """Diagnostics of a state."""
         share = self.share(state)
         values = _values(state, share)
         if not state.present:
             return ServiceFinding(Level.ERROR, "there is no battery", values)
         if state.health not in _GOOD:
             words = next(word for word, number in HEALTH.items() if number == state.health)
-            return ServiceFinding(Level.ERROR, f"the battery tells: {words.lower()}", values)
+            return ServiceFinding(Level.ERROR, f"the battery reports: {words.lower()}", values)
         if math.isnan(share):
-            return ServiceFinding(Level.WARN, "how full the battery is nobody knows", values)
+            return ServiceFinding(Level.WARN, "the charge of the battery is unknown", values)
         percent = f"{share * 100:.0f} %"
         if state.status in (CHARGING, FULL):
             self._level = Level.OK
             return ServiceFinding(
                 Level.OK, f"{'charging' if state.status == CHARGING else 'full'}: {percent}", values
             )
-        self._level = self._judged(share)
+        self._level = self._level_of(share)
         words = {
             Level.ERROR: f"nearly empty: {percent}, charge it now",
             Level.WARN: f"low: {percent}, charge it soon",
         }.get(self._level, f"charged: {percent}")
         return ServiceFinding(self._level, words, values)
 
-    def _judged(self, share: float) -> Level:
+    def _level_of(self, share: float) -> Level:
         for level in (Level.ERROR, Level.WARN):
             recovered = RECOVERY if self._level >= level else 0.0
             if share < self._limits[level] + recovered:

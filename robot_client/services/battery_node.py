@@ -1,4 +1,4 @@
-"""The service ``battery`` in the graph."""
+"""ROS nodes of the service ``battery``."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from robot_client.services import battery
 from robot_client.services.battery import ChargeState, Gauge
 from robot_client.services.health import InputWatch, Level, ServiceFinding
 
-SILENT = 10.0
-"""Seconds without a message after which it says so."""
+SILENT_SECONDS = 10.0
+"""Seconds without a message after which the input counts as silent."""
 
 
 class SysfsBattery:
-    """Publishes what Linux tells of the machine's battery.
+    """Publishes the battery of this machine as reported by Linux.
 
     :param folder: of the power supplies, or of one
-    :param gauge: judges it
+    :param gauge: its limits
     :param period: seconds between two readings
     :raises Unavailable: there is no battery
     """
@@ -33,29 +33,29 @@ class SysfsBattery:
         self._folder = battery.supply(folder)
         self._gauge = gauge
         self._state = ChargeState()
-        self._trouble = ""
+        self._problem = ""
         self._publisher = node.create_publisher(BatteryState, "battery_state", 10)
         node.create_timer(period, self._read)
         self._read()
 
     def finding(self) -> ServiceFinding:
-        """How full it is."""
-        if self._trouble:
-            return ServiceFinding(Level.ERROR, self._trouble)
+        """State of the battery."""
+        if self._problem:
+            return ServiceFinding(Level.ERROR, self._problem)
         return self._gauge.finding(self._state)
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """Nothing to close."""
 
     def _read(self) -> None:
         try:
-            # Looked for each time: a battery that is changed comes back in a folder of another name.
+            # Searched each time: a replaced battery has another folder.
             self._folder = battery.supply(self._root)
         except Unavailable as error:
-            self._trouble = str(error)
+            self._problem = str(error)
             return
-        self._trouble = ""
-        self._state = battery.of_facts(battery.read(self._folder))
+        self._problem = ""
+        self._state = battery.parse_facts(battery.read(self._folder))
         message = _message(self._state._replace(share=self._gauge.share(self._state)))
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.location = self._folder.name
@@ -63,27 +63,27 @@ class SysfsBattery:
 
 
 class TopicBattery:
-    """Says of a battery that another node publishes when it is low.
+    """Reports when a battery that another node publishes is low.
 
     :param topic: of type sensor_msgs/BatteryState
-    :param gauge: judges it
+    :param gauge: its limits
     """
 
     def __init__(self, node: Any, topic: str, gauge: Gauge) -> None:
         self._gauge = gauge
         self._state = ChargeState()
-        self._fresh = InputWatch(topic, SILENT, time.monotonic)
-        node.create_subscription(BatteryState, topic, self._came, qos_profile_sensor_data)
+        self._input = InputWatch(topic, SILENT_SECONDS, time.monotonic)
+        node.create_subscription(BatteryState, topic, self._on_message, qos_profile_sensor_data)
 
     def finding(self) -> ServiceFinding:
-        """How full it is."""
-        return self._fresh.trouble() or self._gauge.finding(self._state)
+        """State of the battery."""
+        return self._input.problem() or self._gauge.finding(self._state)
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """Nothing to close."""
 
-    def _came(self, message: BatteryState) -> None:
-        self._fresh.came()
+    def _on_message(self, message: BatteryState) -> None:
+        self._input.received()
         self._state = _state(message)
 
 
@@ -99,7 +99,7 @@ def _state(message: BatteryState) -> ChargeState:
         share=message.percentage,
         status=message.power_supply_status,
         health=health if health in battery.HEALTH.values() else 0,
-        # Many bases leave out that there is one.
+        # Many bases do not set the field.
         present=message.present or message.voltage > 0,
     )
 

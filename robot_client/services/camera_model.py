@@ -1,4 +1,4 @@
-"""How a camera looks at the world: a pinhole, with the distortion its calibration tells. Pure."""
+"""Camera models: a pinhole with the distortion of its calibration. Pure."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from relay_protocol.errors import Invalid
 
 
 class CameraModel(NamedTuple):
-    """Of one size of picture.
+    """Model for one image size.
 
     :ivar fx: focal length, pixels
     :ivar fy: the same for rows
     :ivar cx: column of the optical axis
     :ivar cy: its row
-    :ivar distortion: as OpenCV has it, none for what was rectified
+    :ivar distortion: OpenCV's coefficients; empty for rectified images
     """
 
     fx: float
@@ -26,7 +26,7 @@ class CameraModel(NamedTuple):
     distortion: tuple[float, ...] = ()
 
     def scaled(self, factor: float) -> CameraModel:
-        """The same camera's, with pictures so many times as wide."""
+        """The model for images scaled by ``factor``."""
         if factor == 1.0:
             return self
         # The middle of the first pixel lies at 0, so its edge at -0.5.
@@ -35,26 +35,27 @@ class CameraModel(NamedTuple):
 
 
 def of_view(width: int, height: int, degrees: float) -> CameraModel:
-    """A lens without distortion that sees so much from the left edge to the right.
+    """A model without distortion and with a given horizontal field of view.
 
     :param width: pixels
     :param height: pixels
+    :param degrees: horizontal field of view
     """
     focal = width / 2 / math.tan(math.radians(degrees) / 2)
     return CameraModel(focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 _MODELS = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8)}
-"""Distortion models of sensor_msgs/CameraInfo that OpenCV's functions for pinholes take, by numbers they may have."""
+"""Supported distortion models of sensor_msgs/CameraInfo, with the numbers of coefficients they may have."""
 
 
 def calibrated(matrix: Sequence[float], distortion: Sequence[float], model: str) -> CameraModel:
-    """What sensor_msgs/CameraInfo tells.
+    """The model of a sensor_msgs/CameraInfo.
 
     :param matrix: ``k``, nine numbers by row
     :param distortion: ``d``
     :param model: ``distortion_model``
-    :raises Invalid: not calibrated, or a model that isn't known here
+    :raises Invalid: not calibrated, or an unsupported distortion model
     """
     fx, _, cx, _, fy, cy = (float(each) for each in matrix[:6])
     if not (fx > 0 and fy > 0 and all(map(math.isfinite, (fx, fy, cx, cy)))):
@@ -65,6 +66,17 @@ def calibrated(matrix: Sequence[float], distortion: Sequence[float], model: str)
     if len(numbers) not in _MODELS.get(model, ()) or not all(map(math.isfinite, numbers)):
         known = ", ".join(filter(None, _MODELS))
         raise Invalid(
-            f"distortion '{model[:40]}' of {len(numbers)} numbers is not known here; these are: {known}"
+            f"distortion '{model[:40]}' of {len(numbers)} numbers is not supported; supported are: {known}"
         )
     return CameraModel(fx, fy, cx, cy, numbers)
+
+
+def distance_of(position: tuple[float, float, float]) -> float:
+    """Metres from the camera to a position in its optical frame."""
+    return math.hypot(*position)
+
+
+def bearing_of(position: tuple[float, float, float]) -> float:
+    """Radians from straight ahead to a position in the camera's optical frame, positive to the left."""
+    x, _, z = position
+    return math.atan2(-x, z)

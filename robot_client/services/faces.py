@@ -1,13 +1,12 @@
-"""Faces in pictures: where they are, and whose. Pure but for reading files.
+"""Finds and recognises faces in images.
 
-They are found by a cascade of multi-block local binary patterns (L. Zhang et al., "Face Detection Based on Multi-Block
-LBP Representation", 2007), OpenCV's, trained on faces from the front; scikit-image has it in its wheel. They are told
-apart by histograms of local binary patterns (T. Ahonen et al., "Face Recognition with Local Binary Patterns", 2004).
+Faces are found by a cascade of multi-block local binary patterns (L. Zhang et al., "Face Detection Based on Multi-Block
+LBP Representation", 2007), OpenCV's, trained on frontal faces; scikit-image has it in its wheel. They are recognised by
+histograms of local binary patterns (T. Ahonen et al., "Face Recognition with Local Binary Patterns", 2004).
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,45 +17,46 @@ from skimage.data import lbp_frontal_face_cascade_filename
 from skimage.feature import Cascade, local_binary_pattern
 
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
+from relay_protocol.text import is_printable
 from robot_client.camera import formats
 from robot_client.camera.formats import Pixels
-from robot_client.services.camera_model import CameraModel
+from robot_client.services.camera_model import CameraModel, bearing_of, distance_of
 
 FACE = 0.17
-"""Metres, the side of the square that is found: from ear to ear of a grown-up."""
+"""Assumed side of the detected square, metres: the width of an adult's face."""
 
-WIDTH = 400
-"""Pixels; wider pictures are looked at so wide."""
-SMALLEST = 24
-"""Pixels of a picture that is looked at, the side of the smallest face: what the cascade was trained with."""
-SCALES = 1.2
-"""From one size of faces that is looked for to the next."""
+SEARCH_WIDTH = 400
+"""Wider images are scaled to this width, pixels."""
+MIN_FACE = 24
+"""Side of the smallest face, pixels of the scaled image; the size the cascade was trained with."""
+SCALE_FACTOR = 1.2
+"""Ratio of successive face sizes in the search."""
 STEP = 1.3
-"""From one place that is looked at to the next, in what is a pixel at the smallest size."""
+"""Step of the search, pixels at the smallest size."""
 
-ALIKE = 0.7
-"""How alike, 0 to 1, a face must be to a person's before it is that person's."""
+MIN_SIMILARITY = 0.7
+"""Least similarity, 0 to 1, by which a face is recognised."""
 
-PICTURES = 500
-"""Of people, at most."""
-LARGEST = 20_000_000
-"""Bytes of one of their files."""
+MAX_IMAGES = 500
+"""Most images of persons."""
+MAX_FILE_BYTES = 20_000_000
+"""Largest image file, bytes."""
 LONGEST_NAME = 64
 _KINDS = (".jpg", ".jpeg", ".png")
 
 _SIDE, _CELLS, _POINTS, _RADIUS = 112, 7, 8, 2
-"""Pixels of a face that is told apart; cells of it in a row; points of a pattern, and how far they are, in pixels."""
+"""Pixels of a scaled face; cells in a row; points of a pattern and their radius, pixels."""
 _PATTERNS = 59
 """Of 8 points the 58 that are uniform, and the others."""
 _SHIFTS = (-0.06, 0.0, 0.06)
-"""Shares of a face by which it may be found beside its place."""
+"""Offsets, as fractions of a face, for which each known face is stored too."""
 
 Grey = npt.NDArray[np.uint8]
 Histograms = npt.NDArray[np.float32]
 
 
 class Box(NamedTuple):
-    """Where a face is, in pixels."""
+    """Square of a face, pixels."""
 
     left: int
     top: int
@@ -64,94 +64,128 @@ class Box(NamedTuple):
 
 
 class SeenFace(NamedTuple):
-    """A face in the frame of the camera's picture: x to the right, y down, z ahead (REP 103).
+    """A face in the camera's optical frame: x to the right, y down, z ahead (REP 103).
 
-    :ivar box: in the picture
-    :ivar name: of the person; ``None`` when it is nobody's that is known
-    :ivar alike: to that person's picture, or to the most alike, 0 to 1; 0 where nobody is known
-    :ivar position: metres, as if it were as large as :data:`FACE`
+    :ivar box: in the image
+    :ivar name: of the person; ``None`` when not recognised
+    :ivar similarity: to the most similar known face, 0 to 1; 0 without known faces
+    :ivar position: metres, assuming a face of the size :data:`FACE`
     """
 
     box: Box
     name: str | None
-    alike: float
+    similarity: float
     position: tuple[float, float, float]
 
     @property
     def distance(self) -> float:
         """Metres from the camera."""
-        return math.hypot(*self.position)
+        return distance_of(self.position)
 
     @property
     def bearing(self) -> float:
-        """Radians from straight ahead, to the left."""
-        x, _, z = self.position
-        return math.atan2(-x, z)
+        """Radians from straight ahead, positive to the left."""
+        return bearing_of(self.position)
 
 
-class Finder:
-    """Finds faces that look into the camera, upright."""
+class FaceFinder:
+    """Finds upright frontal faces."""
 
     def __init__(self) -> None:
         self._cascade: Any = Cascade(lbp_frontal_face_cascade_filename())
 
     def find(self, grey: Grey) -> list[Box]:
-        """The faces in a picture, the largest first.
+        """The faces in an image, the largest first.
 
         :param grey: shape (height, width)
         """
         height, width = grey.shape
-        factor = min(1.0, WIDTH / width)
+        factor = min(1.0, SEARCH_WIDTH / width)
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
         small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA)) if factor < 1.0 else grey
         largest = min(small.shape)
-        if largest <= SMALLEST:
+        if largest <= MIN_FACE:
             return []
         found = self._cascade.detect_multi_scale(
             small.astype(np.float32) / 255,
-            scale_factor=SCALES,
+            scale_factor=SCALE_FACTOR,
             step_ratio=STEP,
-            min_size=(SMALLEST, SMALLEST),
+            min_size=(MIN_FACE, MIN_FACE),
             max_size=(largest, largest),
         )
         boxes = [
             Box(round(each["c"] / factor), round(each["r"] / factor), round(each["width"] / factor))
             for each in found
         ]
-        return _apart(sorted(boxes, key=lambda box: -box.side))
+        return _without_overlaps(sorted(boxes, key=lambda box: -box.side))
 
 
-def _apart(boxes: list[Box]) -> list[Box]:
-    """Without those whose middle is in a larger one: they are the same face."""
-    kept: list[Box] = []
+def _without_overlaps(boxes: list[Box]) -> list[Box]:
+    """Remove squares whose centre is in a larger one: they are the same face."""
+    found: list[Box] = []
     for box in boxes:
         x, y = box.left + box.side / 2, box.top + box.side / 2
-        if not any(0 < x - each.left < each.side and 0 < y - each.top < each.side for each in kept):
-            kept.append(box)
-    return kept
+        if not any(0 < x - each.left < each.side and 0 < y - each.top < each.side for each in found):
+            found.append(box)
+    return found
+
+
+TRACK_REACH = 0.75
+"""How far a face is searched from its earlier place, in its own sides."""
+
+TRACK_SIDE = 48
+"""Faces are scaled to this side for tracking, pixels."""
+
+MIN_TRACKED = 0.5
+"""Least similarity of a face that is found again, -1 to 1."""
+
+
+def track(before: Grey, grey: Grey, box: Box) -> tuple[Box, float] | None:
+    """Find a face again near its earlier place, by normalised cross-correlation.
+
+    :param before: the earlier image
+    :param box: of the face in it
+    :returns: its square and the similarity, -1 to 1; ``None`` if nothing there is similar
+    """
+    height, width = grey.shape
+    reach = round(box.side * TRACK_REACH)
+    left, top = max(0, box.left - reach), max(0, box.top - reach)
+    area = grey[top : min(height, box.top + box.side + reach), left : min(width, box.left + box.side + reach)]
+    face = before[max(0, box.top) : box.top + box.side, max(0, box.left) : box.left + box.side]
+    factor = min(1.0, TRACK_SIDE / box.side)
+    small = [
+        cv2.resize(each, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) for each in (area, face)
+    ]
+    if min(face.shape) < 2 or any(a < f for a, f in zip(small[0].shape, small[1].shape, strict=True)):
+        return None
+    score = cv2.matchTemplate(small[0], small[1], cv2.TM_CCOEFF_NORMED)
+    _, best, _, (x, y) = cv2.minMaxLoc(score)
+    if not best >= MIN_TRACKED:
+        return None
+    return Box(left + round(x / factor), top + round(y / factor), box.side), float(best)
 
 
 class KnownFaces:
-    """Persons, by their faces.
+    """Known persons and their faces.
 
-    :param alike: how alike a face must be to be one's, 0 to 1
+    :param similarity: least similarity of a recognised face, 0 to 1
     """
 
-    def __init__(self, alike: float = ALIKE) -> None:
-        self._alike = alike
+    def __init__(self, similarity: float = MIN_SIMILARITY) -> None:
+        self._min_similarity = similarity
         self._names: list[str] = []
         self._known: list[Histograms] = []
         self._all: Histograms | None = None
 
     @property
     def names(self) -> list[str]:
-        """All of them, in order."""
+        """Names, sorted."""
         return sorted(set(self._names))
 
     def add(self, name: str, grey: Grey, box: Box) -> None:
-        """Know one more face of somebody.
+        """Add a face of a person.
 
-        :param grey: the picture it is in
+        :param grey: the image with the face
         """
         for down in _SHIFTS:
             for right in _SHIFTS:
@@ -160,25 +194,25 @@ class KnownFaces:
                 self._known.append(histograms(grey, at))
         self._all = None
 
-    def who(self, grey: Grey, box: Box) -> tuple[str | None, float]:
-        """Whose face it is, and how alike.
+    def recognise(self, grey: Grey, box: Box) -> tuple[str | None, float]:
+        """Name of the person, or ``None``, and the similarity.
 
-        :param grey: the picture it is in
+        :param grey: the image with the face
         """
         if not self._known:
             return None, 0.0
         if self._all is None:
             self._all = np.stack(self._known)
-        alike = likeness(self._all, histograms(grey, box))
-        best = int(np.argmax(alike))
-        found = float(alike[best])
-        return (self._names[best] if found >= self._alike else None), found
+        similarity = likeness(self._all, histograms(grey, box))
+        best = int(np.argmax(similarity))
+        found = float(similarity[best])
+        return (self._names[best] if found >= self._min_similarity else None), found
 
 
 def histograms(grey: Grey, box: Box) -> Histograms:
-    """How often each pattern is in each cell of a face; what lies outside the picture repeats its edge.
+    """Frequency of each pattern in each cell of a face. Outside the image its edge is repeated.
 
-    :returns: shape (cells × patterns,), of each cell 1 in all
+    :returns: shape (cells × patterns,), the sum of each cell is 1
     """
     rows = np.clip(np.arange(box.top, box.top + box.side), 0, grey.shape[0] - 1)
     columns = np.clip(np.arange(box.left, box.left + box.side), 0, grey.shape[1] - 1)
@@ -194,7 +228,7 @@ def histograms(grey: Grey, box: Box) -> Histograms:
 
 
 def likeness(known: Histograms, face: Histograms) -> npt.NDArray[np.float64]:
-    """How alike a face is to others: 1 less half of the χ² between their histograms, 0 to 1.
+    """Similarity of a face to others: 1 minus half the χ² distance of the histograms, 0 to 1.
 
     :param known: shape (faces, cells × patterns)
     :param face: shape (cells × patterns,)
@@ -205,27 +239,31 @@ def likeness(known: Histograms, face: Histograms) -> npt.NDArray[np.float64]:
     return found
 
 
-def read_people(folder: Path, finder: Finder, alike: float = ALIKE) -> KnownFaces:
-    """People of a folder: each file of a face is a person of its name, each folder one with several.
+def read_people(folder: Path, finder: FaceFinder, similarity: float = MIN_SIMILARITY) -> KnownFaces:
+    """Read known persons from a folder: one image file, or a subfolder of images, for each, named after the person.
 
-    :raises Unavailable: it can't be read, or there is nobody in it
-    :raises Invalid: a file that is no picture, or in which no face is found
+    :raises Unavailable: the folder cannot be read, or has no images
+    :raises Invalid: a file is not an image, or has no face
     """
-    people = KnownFaces(alike)
+    people = KnownFaces(similarity)
     count = 0
     for name, path in _files(folder):
         count += 1
-        if count > PICTURES:
-            raise Invalid(f"{folder}: there are more than {PICTURES} pictures")
-        if not (0 < len(name) <= LONGEST_NAME and name.isprintable()):
-            raise Invalid(f"{folder}: '{name[:LONGEST_NAME]}' can't be a name")
-        grey = read_picture(path)
+        if count > MAX_IMAGES:
+            raise Invalid(f"{folder}: more than {MAX_IMAGES} images")
+        if not (0 < len(name) <= LONGEST_NAME and is_printable(name)):
+            raise Invalid(
+                f"{folder}: '{name[:LONGEST_NAME]}' is no name of 1 to {LONGEST_NAME} printable characters"
+            )
+        grey = read_grey_image(path)
         boxes = finder.find(grey)
         if not boxes:
-            raise Invalid(f"{path}: no face is found in it; one is that looks into the camera, upright")
+            raise Invalid(
+                f"{path}: no face found; use an image of an upright face that looks into the camera"
+            )
         people.add(name, grey, boxes[0])
     if not count:
-        raise Unavailable(f"{folder}: there is no picture in it ({', '.join(_KINDS)})")
+        raise Unavailable(f"{folder}: the folder has no images ({', '.join(_KINDS)})")
     return people
 
 
@@ -240,46 +278,58 @@ def _files(folder: Path) -> list[tuple[str, Path]]:
     return sorted(found)
 
 
-def read_picture(path: Path) -> Grey:
-    """A JPEG or PNG file, grey.
+def read_grey_image(path: Path) -> Grey:
+    """Read a JPEG or PNG file as grey image.
 
-    :raises Unavailable: it can't be read
-    :raises Invalid: it is no such picture, or too large
+    :raises Unavailable: it cannot be read
+    :raises Invalid: not such an image, or too large
     """
     try:
         with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
+            data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise Unavailable(f"{path}: {error.strerror}") from None
-    if len(data) > LARGEST:
-        raise Invalid(f"{path} is larger than {LARGEST // 1_000_000} MB")
+    if len(data) > MAX_FILE_BYTES:
+        raise Invalid(f"{path} is larger than {MAX_FILE_BYTES // 1_000_000} MB")
     try:
-        return grey_of(formats.decoded(data).pixels)
+        return grey_of(formats.decode_file(data).pixels)
     except SwitchboardError as error:
         raise Invalid(f"{path}: {error}") from None
 
 
 def grey_of(pixels: Pixels) -> Grey:
-    """The same picture without colours.
+    """Convert an image to grey.
 
     :param pixels: BGR or grey
     """
     return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def look(pixels: Pixels, lens: CameraModel, finder: Finder, people: KnownFaces) -> list[SeenFace]:
-    """The faces in a picture, the largest first.
+def find_faces(pixels: Pixels, model: CameraModel, finder: FaceFinder, people: KnownFaces) -> list[SeenFace]:
+    """Find and recognise the faces in an image, the largest first.
 
     :param pixels: BGR or grey
-    :param lens: of this picture
+    :param model: camera model for this image size
     """
     grey = grey_of(pixels)
-    return [SeenFace(box, *people.who(grey, box), _position(box, lens)) for box in finder.find(grey)]
+    return recognise_faces(grey, finder.find(grey), model, people)
 
 
-def _position(box: Box, lens: CameraModel) -> tuple[float, float, float]:
-    """Where a face of the usual size is. Distortion is left out: it is less than faces differ."""
-    ahead = lens.fx * FACE / box.side
-    x = (box.left + box.side / 2 - lens.cx) / lens.fx * ahead
-    y = (box.top + box.side / 2 - lens.cy) / lens.fy * ahead
+def recognise_faces(grey: Grey, boxes: list[Box], model: CameraModel, people: KnownFaces) -> list[SeenFace]:
+    """Recognise the faces that were found in an image.
+
+    :param model: camera model for this image size
+    """
+    found = []
+    for box in boxes:
+        name, similarity = people.recognise(grey, box)
+        found.append(SeenFace(box=box, name=name, similarity=similarity, position=_position(box, model)))
+    return found
+
+
+def _position(box: Box, model: CameraModel) -> tuple[float, float, float]:
+    """Position of a face of the assumed size. Distortion is ignored: faces differ more."""
+    ahead = model.fx * FACE / box.side
+    x = (box.left + box.side / 2 - model.cx) / model.fx * ahead
+    y = (box.top + box.side / 2 - model.cy) / model.fy * ahead
     return (x, y, ahead)

@@ -1,4 +1,4 @@
-"""The service ``faces`` in the graph."""
+"""ROS node of the service ``faces``."""
 
 from __future__ import annotations
 
@@ -11,64 +11,82 @@ from builtin_interfaces.msg import Duration
 from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from robot_client.services.faces import FACE, Finder, KnownFaces, SeenFace, look
+from robot_client.services.faces import FACE, FaceFinder, KnownFaces, SeenFace, grey_of, recognise_faces
 from robot_client.services.health import Level, ServiceFinding
-from robot_client.services.pictures import ImageRequest, ImageSource
+from robot_client.services.images import ImageRequest, ImageSource
+from robot_client.services.placement import CameraImage, RunOptions, face_function
 
-STAYS = 1.0
-"""Seconds a face is shown after the picture it was seen in."""
+LIFETIME_SECONDS = 1.0
+"""Lifetime of a face's marker, seconds."""
 
 
 class Faces:
-    """Says which faces a camera sees, where and whose.
+    """Publishes the faces a camera sees, with position and name.
 
-    :param asked: the camera
-    :param finder: finds them
-    :param people: who is known
-    :param rate: pictures per second that are looked at, at most
+    :param request: the camera
+    :param finder: detector
+    :param people: known persons
+    :param rate: most images per second to process
+    :param run: where faces are found; they are recognised here
     """
 
     def __init__(
-        self, node: Any, asked: ImageRequest, finder: Finder, people: KnownFaces, rate: float
+        self,
+        node: Any,
+        request: ImageRequest,
+        finder: FaceFinder,
+        people: KnownFaces,
+        rate: float,
+        run: RunOptions,
     ) -> None:
-        cv2.setNumThreads(1)  # a robot's other cores have other work
-        self._finder = finder
+        cv2.setNumThreads(1)  # leaves the other cores to other programs
+        self._run = run
+        self._find = face_function(finder, run)
         self._people = people
         self._period = 1 / rate
         self._next = 0.0
-        self._took = 0.0
+        self._processing_seconds = 0.0
         self._seen: list[SeenFace] = []
         self._array = node.create_publisher(MarkerArray, "faces", 10)
         self._text = node.create_publisher(String, "faces/seen", 10)
-        self._pictures = ImageSource(node, asked, self._saw)
+        self._images = ImageSource(node, request, self._on_image)
 
     def finding(self) -> ServiceFinding:
-        """Whom it sees."""
-        trouble = self._pictures.finding()
-        if trouble:
-            return trouble
-        values = {"people": str(len(self._people.names)), "look_ms": f"{self._took * 1000:.0f}"}
+        """The faces seen now."""
+        problem = self._images.finding()
+        if problem:
+            return problem
+        values = {
+            "people": str(len(self._people.names)),
+            "processing_ms": f"{self._processing_seconds * 1000:.0f}",
+            **self._find.shown(),
+        }
         names = ", ".join(each.name or "a face" for each in self._seen)
         return ServiceFinding(Level.OK, f"sees {names}" if names else "sees no face", values)
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """Close the link to the workers."""
+        self._run.client.close()
 
-    def _saw(self, message: bytes, header: Header) -> None:
+    def _on_image(self, message: bytes, header: Header) -> None:
         began = time.monotonic()
         if began < self._next:
             return
-        picture = self._pictures.pixels(message)
-        lens = self._pictures.lens(picture.width, picture.height)
-        self._seen = look(picture.pixels, lens, self._finder, self._people)
+        image = self._images.pixels(message)
+        model = self._images.camera_model(image.width, image.height)
+        boxes = self._find(CameraImage(image.pixels, self._images.file(message)))
+        self._seen = recognise_faces(grey_of(image.pixels), boxes, model, self._people)
         ended = time.monotonic()
-        self._took = ended - began
-        # However long a look takes, half of a core is left.
-        self._next = max(began + self._period, ended + self._took)
+        self._processing_seconds = ended - began
+        # Half of a core stays free, however long an image takes.
+        busy = 0.0 if self._find.ran_away else self._processing_seconds
+        self._next = max(began + self._period, ended + busy)
         self._array.publish(
-            MarkerArray(markers=[self._marker(*each, header) for each in enumerate(self._seen)])
+            MarkerArray(
+                markers=[self._marker(number, seen, header) for number, seen in enumerate(self._seen)]
+            )
         )
-        self._text.publish(String(data=self._told(header)))
+        self._text.publish(String(data=self._as_json(header)))
 
     def _marker(self, number: int, seen: SeenFace, header: Header) -> Marker:
         marker = Marker(header=header, ns="faces", id=number, type=Marker.SPHERE)
@@ -78,21 +96,21 @@ class Faces:
         marker.pose.orientation.w = 1.0
         marker.scale.x = marker.scale.y = marker.scale.z = FACE
         marker.color.a = 1.0
-        # Who is known is green, others are yellow.
+        # Recognised faces are green, others yellow.
         marker.color.g, marker.color.r = 1.0, 0.0 if seen.name else 1.0
         marker.text = seen.name or ""
-        marker.lifetime = Duration(sec=int(STAYS), nanosec=int(STAYS % 1 * 1e9))
+        marker.lifetime = Duration(sec=int(LIFETIME_SECONDS), nanosec=int(LIFETIME_SECONDS % 1 * 1e9))
         return marker
 
-    def _told(self, header: Header) -> str:
-        """The same for programs that greet somebody."""
-        told = {
+    def _as_json(self, header: Header) -> str:
+        """The faces as JSON, for other programs."""
+        seen = {
             "stamp": header.stamp.sec + header.stamp.nanosec / 1e9,
             "frame": header.frame_id,
             "faces": [
                 {
                     "name": each.name,
-                    "alike": round(each.alike, 3),
+                    "similarity": round(each.similarity, 3),
                     "distance": round(each.distance, 2),
                     "bearing": round(each.bearing, 3),
                     "box": list(each.box),
@@ -100,4 +118,4 @@ class Faces:
                 for each in self._seen
             ],
         }
-        return orjson.dumps(told).decode()
+        return orjson.dumps(seen).decode()

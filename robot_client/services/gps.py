@@ -27,21 +27,21 @@ QUALITIES: dict[int, tuple[int, float]] = {
     5: (GBAS_FIX, 0.5),
     9: (SBAS_FIX, 1.0),
 }
-"""Quality in GGA → status, and metres (one sigma) that a dilution of 1 stands for. Estimated, typed in and simulated
-positions are none."""
+"""By quality in GGA: status, and standard deviation in metres at a dilution of 1. Estimated, manual and simulated
+positions (6 to 8) are missing, so they count as no fix."""
 
 SYSTEMS = {"GP": 1, "GL": 2, "GB": 4, "BD": 4, "GA": 8, "GN": 0}
-"""Who speaks → service of NavSatStatus; ``GN`` are several together."""
+"""By talker id of a sentence: service of NavSatStatus; ``GN`` means several together."""
 
 UPWARD = 2.0
-"""Heights are so many times as uncertain as places."""
+"""Ratio of the standard deviations of height and horizontal position."""
 
 
 class Fix(NamedTuple):
-    """Where the receiver is. Coordinates are NaN without a fix.
+    """Position of the receiver. Coordinates are NaN without a fix.
 
     :ivar status: of NavSatStatus
-    :ivar service: systems that were heard so far, bits of NavSatStatus
+    :ivar service: systems that were received so far, bits of NavSatStatus
     :ivar latitude: degrees
     :ivar longitude: degrees
     :ivar altitude: metres over the ellipsoid (WGS 84), NaN if not known
@@ -57,37 +57,39 @@ class Fix(NamedTuple):
 
 
 class Lines:
-    """Cuts bytes into lines; what is too long for a sentence is thrown away, and counted."""
+    """Cuts bytes into lines; lines too long for a sentence are discarded and counted."""
 
     def __init__(self) -> None:
         self.too_long = 0
-        self._rest = b""
+        self._unfinished = b""
         self._skipping = False
 
     def feed(self, data: bytes) -> Iterator[bytes]:
         """The lines that are complete now, without their ends."""
-        *lines, rest = (self._rest + data).split(b"\n")
-        self._rest = b""
+        *lines, unfinished = (self._unfinished + data).split(b"\n")
+        self._unfinished = b""
         for line in lines:
             skipped, self._skipping = self._skipping, False
             if skipped or len(line) > LONGEST:
                 self.too_long += not skipped
             elif line.strip():
                 yield line.strip()
-        if len(rest) > LONGEST:
+        if len(unfinished) > LONGEST:
             self.too_long += not self._skipping
             self._skipping = True
         else:
-            self._rest = rest
+            self._unfinished = unfinished
 
 
 class Nmea:
     """Reads sentences.
 
-    GGA gives the fix. What can't be read is counted and passed over, and so are sentences of other kinds.
+    GGA has the fix. Sentences of other kinds, and those that can't be read, are counted and ignored.
 
-    :ivar good: sentences that could be read
-    :ivar bad: those that could not: noise, a wrong sum, fields that make no sense
+    :ivar good: number of sentences that could be read
+    :ivar bad: number of sentences that could not: noise, a wrong checksum, invalid fields
+    :ivar satellites: number of satellites in use
+    :ivar last: latest fix
     """
 
     def __init__(self) -> None:
@@ -98,8 +100,8 @@ class Nmea:
         self._service = 0
 
     def read(self, line: bytes) -> Fix | None:
-        """The fix in a line, if it is one that has a fix."""
-        start = line.rfind(b"$")  # one that was cut may stand before it
+        """The fix in a line; ``None``: the line has none."""
+        start = line.rfind(b"$")  # a truncated sentence may precede it
         try:
             sentence = pynmea2.parse(line[max(0, start) :].decode("ascii"), check=True)
             fix = self._fix(sentence) if isinstance(sentence, pynmea2.GGA) else None
@@ -113,9 +115,9 @@ class Nmea:
         return fix
 
     def finding(self, too_long: int = 0) -> ServiceFinding:
-        """What is said of it.
+        """Diagnostics of the receiver.
 
-        :param too_long: lines that were none
+        :param too_long: number of lines that were too long for a sentence
         """
         values = {
             "sentences": str(self.good),
@@ -123,7 +125,7 @@ class Nmea:
             "satellites": str(self.satellites),
         }
         if self.last is None:
-            return ServiceFinding(Level.WARN, "no position was heard yet", values)
+            return ServiceFinding(Level.WARN, "no position was received yet", values)
         if self.last.status == NO_FIX:
             return ServiceFinding(Level.WARN, "the receiver has no fix", values)
         if self.last.variances:
@@ -131,7 +133,7 @@ class Nmea:
         return ServiceFinding(Level.OK, f"a fix of {self.satellites} satellites", values)
 
     def _fix(self, sentence: Any) -> Fix:
-        """:raises ValueError: fields that make no sense"""
+        """:raises ValueError: a field is invalid"""
         self._service |= SYSTEMS.get(sentence.talker, 0)
         self.satellites = int(sentence.num_sats or 0)
         status, sigma = QUALITIES.get(int(sentence.gps_qual or 0), (NO_FIX, 0.0))
@@ -139,18 +141,18 @@ class Nmea:
             return Fix(NO_FIX, self._service, math.nan, math.nan, math.nan, None)
         latitude, longitude = float(sentence.latitude), float(sentence.longitude)
         if not (abs(latitude) <= 90 and abs(longitude) <= 180):
-            raise ValueError("there is no such place")
+            raise ValueError("the coordinates are out of range")
         altitude = _number(sentence.altitude) + _number(sentence.geo_sep)
         dilution = _number(sentence.horizontal_dil)
         variances = None
         if dilution > 0:
-            across = (dilution * sigma) ** 2
-            variances = (across, across, across * UPWARD**2)
+            horizontal = (dilution * sigma) ** 2
+            variances = (horizontal, horizontal, horizontal * UPWARD**2)
         return Fix(status, self._service, latitude, longitude, altitude, variances)
 
 
 def _number(field: Any) -> float:
-    """:raises ValueError: it is none, or not finite"""
+    """:raises ValueError: it is not a number, or not finite"""
     if field in (None, ""):
         return math.nan
     number = float(field)

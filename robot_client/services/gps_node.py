@@ -1,4 +1,4 @@
-"""The service ``gps`` in the graph."""
+"""ROS node of the service ``gps``."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from robot_client.services.gps import Fix, Lines, Nmea
 from robot_client.services.gps_source import ByteReader, ByteSource
 from robot_client.services.health import InputWatch, ServiceFinding
 
-SILENT = 5.0
-"""Seconds without a sentence after which it says so."""
+SILENT_SECONDS = 5.0
+"""Seconds without a sentence after which the input counts as silent."""
 
 
 class Gps:
-    """Publishes what a receiver says.
+    """Publishes the positions of a receiver.
 
-    :param name: of the source, for people
+    :param name: of the source, for display
     :param open_source: opens it
     :param frame: coordinate frame of the antenna
     """
@@ -30,23 +30,23 @@ class Gps:
         self._frame = frame
         self._lines = Lines()
         self._nmea = Nmea()
-        self._fresh = InputWatch(name, SILENT, time.monotonic)
+        self._input = InputWatch(name, SILENT_SECONDS, time.monotonic)
         self._publisher = node.create_publisher(NavSatFix, "fix", 10)
-        self._reader = ByteReader(name, open_source, self._came)
+        self._reader = ByteReader(name, open_source, self._on_message)
 
     def finding(self) -> ServiceFinding:
         """Whether there is a fix, and how good."""
-        trouble = self._reader.finding() or self._fresh.trouble()
+        problem = self._reader.finding() or self._input.problem()
         found = self._nmea.finding(self._lines.too_long)
-        return trouble._replace(values=found.values) if trouble else found
+        return problem._replace(values=found.values) if problem else found
 
     def close(self) -> None:
-        """Let go of the receiver."""
+        """Close the receiver."""
         self._reader.close()
 
-    def _came(self, data: bytes) -> None:
-        """In the reader's thread: publishers may be used in any."""
-        self._fresh.came()
+    def _on_message(self, data: bytes) -> None:
+        """Runs in the reader's thread; publishers are thread-safe."""
+        self._input.received()
         for line in self._lines.feed(data):
             fix = self._nmea.read(line)
             if fix is not None:
@@ -54,7 +54,7 @@ class Gps:
 
     def _message(self, fix: Fix) -> NavSatFix:
         message = NavSatFix()
-        # When it was heard: the clocks of receiver and robot need not agree.
+        # Time of reception: the clocks of receiver and robot may differ.
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.header.frame_id = self._frame
         message.status.status, message.status.service = fix.status, fix.service

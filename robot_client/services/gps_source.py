@@ -1,4 +1,4 @@
-"""Where sentences come from: a serial device, a TCP server, or a file that somebody recorded."""
+"""Sources of NMEA sentences: a serial device, a TCP server or a recorded file."""
 
 from __future__ import annotations
 
@@ -17,55 +17,56 @@ from typing import Protocol
 from relay_protocol.errors import Invalid, Unavailable
 from robot_client.services.health import Level, ServiceFinding
 
-AGAIN = 1.0
-"""Seconds until a source that was lost is opened again."""
-CONNECT = 5.0
-"""Seconds for a server to answer."""
-LOOK = 0.2
-"""Seconds in which an end is noticed."""
+RETRY_SECONDS = 1.0
+"""Seconds until a lost source is reopened."""
+CONNECT_SECONDS = 5.0
+"""Timeout of a connection, seconds."""
+POLL_SECONDS = 0.2
+"""Longest wait of one read, seconds."""
 CHUNK = 4096
 
 BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 
 
 class ByteSource(Protocol):
-    """Gives bytes."""
+    """A source of bytes."""
 
     def read(self) -> bytes:
-        """What has come, within :data:`LOOK`; nothing is fine.
+        """Bytes received within :data:`POLL_SECONDS`; may be empty.
 
-        :raises EOFError: there is no more
-        :raises OSError: it is lost
+        :raises EOFError: end of the file
+        :raises OSError: the source is lost
         """
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the source."""
 
 
 class SerialSource:
-    """A serial device, or whatever else can be read like one.
+    """A serial device, or another file that is read like one.
 
     :param baud: bits per second
     :raises OSError: it can't be opened
     """
 
     def __init__(self, path: Path, baud: int) -> None:
-        # It must not become our terminal, whose hang-up would end us.
+        # O_NOCTTY: a hang-up of the device must not end this process.
         self._file = os.open(path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             if os.isatty(self._file):
                 _set_raw(self._file, baud)
         except termios.error as error:
             os.close(self._file)
-            raise OSError(*error.args) from None
+            code, message = error.args
+            raise OSError(code, message) from None
 
     def read(self) -> bytes:
         """See :class:`ByteSource`."""
-        if not select.select([self._file], [], [], LOOK)[0]:
+        if not select.select([self._file], [], [], POLL_SECONDS)[0]:
             return b""
         data = os.read(self._file, CHUNK)
         if not data:
-            raise OSError(0, "it was closed at the other end")
+            raise OSError(0, "the other end closed it")
         return data
 
     def close(self) -> None:
@@ -80,9 +81,9 @@ class TcpSource:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._socket = socket.create_connection((host, port), timeout=CONNECT)
+        self._socket = socket.create_connection((host, port), timeout=CONNECT_SECONDS)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self._socket.settimeout(LOOK)
+        self._socket.settimeout(POLL_SECONDS)
 
     def read(self) -> bytes:
         """See :class:`ByteSource`."""
@@ -91,7 +92,7 @@ class TcpSource:
         except TimeoutError:
             return b""
         if not data:
-            raise OSError(0, "the server has hung up")
+            raise OSError(0, "the server closed the connection")
         return data
 
     def close(self) -> None:
@@ -100,7 +101,7 @@ class TcpSource:
 
 
 class FileSource:
-    """A file, played at the pace at which receivers speak.
+    """A file, replayed at the pace of a receiver.
 
     :param pace: seconds between two positions
     :raises OSError: it can't be opened
@@ -125,24 +126,24 @@ class FileSource:
         self._file.close()
 
 
-def opener(text: str, baud: int, pace: float) -> Callable[[], ByteSource]:
-    """What opens the source that somebody named.
+def source_factory(text: str, baud: int, pace: float) -> Callable[[], ByteSource]:
+    """A function that opens a source.
 
     :param text: ``tcp://host:port``, or the path of a device or a file
-    :raises Invalid: it makes no sense
-    :raises Unavailable: there is no such file
+    :raises Invalid: invalid address
+    :raises Unavailable: the file does not exist
     """
     if text.startswith("tcp://"):
         found = re.fullmatch(r"tcp://(?:\[([^]]+)\]|([^:/]+)):([0-9]{1,5})/?", text)
         if not found or not 0 < int(found[3]) < 65536:
-            raise Invalid(f"'{text}' is no address: write tcp://HOST:PORT")
+            raise Invalid(f"'{text}' is not an address; write tcp://HOST:PORT")
         host, port = found[1] or found[2], int(found[3])
         return lambda: TcpSource(host, port)
     path = Path(text)
     try:
         regular = stat.S_ISREG(path.stat().st_mode)
     except OSError as error:
-        # Devices come and go; a name that is in no folder of devices is a slip of the pen.
+        # Devices may appear later; a missing file outside /dev is an error.
         if path.parent.is_relative_to("/dev"):
             return lambda: SerialSource(path, baud)
         raise Unavailable(f"{text}: {error.strerror}") from None
@@ -154,8 +155,8 @@ def opener(text: str, baud: int, pace: float) -> Callable[[], ByteSource]:
 class ByteReader:
     """Reads a source in a thread of its own, and opens it again when it is lost.
 
-    :param name: of the source, for people
-    :param on_data: called in the thread with what came
+    :param name: of the source, for display
+    :param on_data: called in the thread with received bytes
     """
 
     def __init__(
@@ -165,16 +166,16 @@ class ByteReader:
         self._open = open_source
         self._on_data = on_data
         self._ending = threading.Event()
-        self._trouble: ServiceFinding | None = ServiceFinding(Level.STALE, f"waiting for {name}")
+        self._problem: ServiceFinding | None = ServiceFinding(Level.STALE, f"waiting for {name}")
         self._thread = threading.Thread(target=self._run, name="gps-source", daemon=True)
         self._thread.start()
 
     def finding(self) -> ServiceFinding | None:
-        """What is wrong with the source, else ``None``."""
-        return self._trouble
+        """Problem with the source, else ``None``."""
+        return self._problem
 
     def close(self) -> None:
-        """Read no more."""
+        """Stop reading."""
         self._ending.set()
         self._thread.join(2.0)
 
@@ -183,11 +184,11 @@ class ByteReader:
             try:
                 self._read_all()
             except EOFError:
-                self._trouble = ServiceFinding(Level.STALE, f"{self._name} has been played to its end")
+                self._problem = ServiceFinding(Level.STALE, f"{self._name} has ended")
                 return
             except OSError as error:
-                self._trouble = ServiceFinding(Level.ERROR, f"{self._name}: {error.strerror or error}")
-                self._ending.wait(AGAIN)
+                self._problem = ServiceFinding(Level.ERROR, f"{self._name}: {error.strerror or error}")
+                self._ending.wait(RETRY_SECONDS)
 
     def _read_all(self) -> None:
         source = self._open()
@@ -195,16 +196,16 @@ class ByteReader:
             while not self._ending.is_set():
                 data = source.read()
                 if data:
-                    self._trouble = None
+                    self._problem = None
                     self._on_data(data)
         finally:
             source.close()
 
 
 def _set_raw(file: int, baud: int) -> None:
-    """Eight bits, no parity, one stop bit, nothing translated.
+    """Set eight bits, no parity, one stop bit, raw mode.
 
-    :raises termios.error: the device does not take it
+    :raises termios.error: the device rejects it
     """
     speed = getattr(termios, f"B{baud}")
     settings = termios.tcgetattr(file)

@@ -1,4 +1,4 @@
-"""What a service says of itself. Pure: facts in, findings out."""
+"""Diagnostics of services."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Level(enum.IntEnum):
 
 
 class ServiceFinding(NamedTuple):
-    """How a service is, and the figures behind that."""
+    """State of a service, with measurements."""
 
     level: Level
     message: str
@@ -26,9 +26,9 @@ class ServiceFinding(NamedTuple):
 
 
 class InputWatch:
-    """Whether an input still comes.
+    """Watches whether an input is still received.
 
-    :param what: the input, as it is named to people
+    :param what: name of the input, for display
     :param longest: seconds without it after which it counts as silent
     :param clock: seconds, monotonic
     """
@@ -39,12 +39,12 @@ class InputWatch:
         self._clock = clock
         self._last: float | None = None
 
-    def came(self) -> None:
-        """It has come just now."""
+    def received(self) -> None:
+        """The input was received now."""
         self._last = self._clock()
 
-    def trouble(self) -> ServiceFinding | None:
-        """What to say when it does not come, else ``None``."""
+    def problem(self) -> ServiceFinding | None:
+        """The problem when it is silent, else ``None``."""
         if self._last is None:
             return ServiceFinding(Level.STALE, f"waiting for {self._what}")
         silent = self._clock() - self._last

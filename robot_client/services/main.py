@@ -11,14 +11,46 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from relay_protocol.errors import SwitchboardError
-from relay_protocol.text import inert
-from robot_client.help_text import examples
-from robot_client.numbers import Number
-from robot_client.services.gps_source import BAUDS, opener
-from robot_client.services.options import camera, lens
+from relay_protocol.text import escape_unprintable
+from robot_client.command_line import Number, examples
+from robot_client.offload.device import Where
+from robot_client.services.gps_source import BAUDS, source_factory
+
+
+def camera_model_options(function: Any) -> Any:
+    """Options of a camera model."""
+    info = click.option(
+        "--info",
+        default="",
+        metavar="TOPIC",
+        help="Topic of its CameraInfo. Default: camera_info in the namespace of the images.",
+    )
+    view = click.option(
+        "--view",
+        type=Number(1, 170),
+        metavar="DEG",
+        help="Horizontal field of view, for cameras without a CameraInfo.",
+    )
+    return info(view(function))
+
+
+def camera_options(function: Any) -> Any:
+    """Options of a camera."""
+    image = click.option(
+        "--image",
+        default="/camera/image_raw",
+        show_default=True,
+        metavar="TOPIC",
+        help="Topic of the images.",
+    )
+    compressed = click.option(
+        "--compressed", is_flag=True, help="The images are of type CompressedImage (JPEG or PNG)."
+    )
+    return image(compressed(camera_model_options(function)))
+
 
 if TYPE_CHECKING:
-    from robot_client.services.pictures import ImageRequest
+    from robot_client.services.images import ImageRequest
 
 COMMAND = "switchboard-robot-service"
 
@@ -31,14 +63,14 @@ COMMAND = "switchboard-robot-service"
 def main() -> None:
     """Run one service of a robot, a node in its ROS 2 graph.
 
-    Each prints READY when its topics are there, says on /diagnostics how it is, and ends by SIGINT or SIGTERM.
+    Each prints READY when its topics exist, reports its state on /diagnostics, and ends on SIGINT or SIGTERM.
     """
-    # Whatever the umask was: what is made here is its owner's alone.
+    # Files created here are private, whatever the umask was.
     os.umask(0o077)
 
 
 def service(*lines: str) -> Callable[[Callable[..., None]], click.Command]:
-    """A subcommand of its function's name, with what all have.
+    """Make a function a subcommand, with the common options.
 
     :param lines: examples, without the name of the command
     """
@@ -49,20 +81,20 @@ def service(*lines: str) -> Callable[[Callable[..., None]], click.Command]:
             "--namespace",
             default="",
             metavar="NS",
-            help="Put before the names of the node and of its topics.",
+            help="Namespace of the node and its topics.",
         )
-        return main.command(function.__name__, epilog=shown)(namespace(_in_words(function)))
+        return main.command(function.__name__, epilog=shown)(namespace(_errors_as_click(function)))
 
     return make
 
 
-def _in_words(function: Callable[..., None]) -> Callable[..., None]:
-    """What is missing or goes wrong becomes a sentence on stderr and exit code 1."""
+def _errors_as_click(function: Callable[..., None]) -> Callable[..., None]:
+    """Turn errors and missing packages into an error message and exit code 1."""
 
     @functools.wraps(function)
     def run(*args: Any, **options: Any) -> None:
         try:
-            import rclpy  # noqa: F401  # only to see that it is there
+            import rclpy  # noqa: F401  # checks that it is installed
         except ImportError as error:
             raise click.ClickException(
                 f"there is no ROS 2 for this Python ({error}): "
@@ -73,13 +105,13 @@ def _in_words(function: Callable[..., None]) -> Callable[..., None]:
         except ModuleNotFoundError as error:
             raise click.ClickException(f"{error.name} is missing; install the extra 'services'") from None
         except SwitchboardError as error:
-            raise click.ClickException(inert(str(error))) from None
+            raise click.ClickException(escape_unprintable(str(error))) from None
 
     return run
 
 
-def _asked(topic: str, compressed: bool, info: str, view: float | None) -> ImageRequest:
-    from robot_client.services.pictures import ImageRequest
+def _image_request(topic: str, compressed: bool, info: str, view: float | None) -> ImageRequest:
+    from robot_client.services.images import ImageRequest
 
     return ImageRequest(topic, compressed, info, view or 0.0)
 
@@ -89,17 +121,17 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Image
     "--near 0.8 --sectors 8",
     "--depth /camera/depth/image_rect_raw --sectors 5 --height 0.3",
 )
-@click.option("--scan", default="/scan", show_default=True, metavar="TOPIC", help="Of type LaserScan.")
+@click.option("--scan", default="/scan", show_default=True, metavar="TOPIC", help="Topic of type LaserScan.")
 @click.option(
-    "--depth", default="", metavar="TOPIC", help="Depth as Image (16UC1, 32FC1), instead of a scan."
+    "--depth", default="", metavar="TOPIC", help="Topic of a depth image (16UC1, 32FC1), instead of a scan."
 )
-@lens
+@camera_model_options
 @click.option(
     "--sectors",
     type=click.IntRange(1, 360),
     default=12,
     show_default=True,
-    help="Directions that are told apart.",
+    help="Number of directions.",
 )
 @click.option(
     "--near",
@@ -107,7 +139,7 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Image
     default=0.5,
     show_default=True,
     metavar="M",
-    help="Nearer than this to the sensor is too near.",
+    help="Distance from the sensor below which obstacles/near is true.",
 )
 @click.option(
     "--height",
@@ -115,7 +147,7 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Image
     default=0.2,
     show_default=True,
     metavar="M",
-    help="Of the camera.",
+    help="Height of the camera above the floor.",
 )
 @click.option(
     "--low",
@@ -123,7 +155,7 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Image
     default=0.05,
     show_default=True,
     metavar="M",
-    help="What is lower over the floor is none (depth).",
+    help="Objects lower than this are no obstacles (depth only).",
 )
 @click.option(
     "--high",
@@ -131,9 +163,9 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Image
     default=1.5,
     show_default=True,
     metavar="M",
-    help="What is higher is none (depth).",
+    help="Objects higher than this are no obstacles (depth only).",
 )
-@click.option("--frame", default="", help="Of what it says: x ahead, y left. Default: the sensor's.")
+@click.option("--frame", default="", help="Frame of the output, x ahead, y left. Default: the sensor's.")
 def obstacles(
     namespace: str,
     scan: str,
@@ -147,7 +179,7 @@ def obstacles(
     high: float,
     frame: str,
 ) -> None:
-    """Say what is nearest in each direction.
+    """Publish the nearest obstacle in each direction.
 
     Topics out: obstacles (LaserScan, a ray for each sector), obstacles/places (PoseArray, the nearest first),
     obstacles/near (Bool).
@@ -158,7 +190,7 @@ def obstacles(
 
     if low >= high:
         raise click.BadParameter(f"--low ({low:g}) must be less than --high ({high:g})")
-    source = _asked(depth, False, info, view) if depth else scan
+    source = _image_request(depth, False, info, view) if depth else scan
     settings = ObstacleSettings(sectors, near, frame)
     band = Band(height, low, high)
     run("obstacles", namespace, lambda node: Obstacles(node, source, settings, band))
@@ -166,14 +198,14 @@ def obstacles(
 
 @service("", "--topic /battery_state --low 30 --critical 15", "--folder /sys/class/power_supply/BAT1")
 @click.option(
-    "--topic", default="", metavar="TOPIC", help="Judge a BatteryState that another node publishes."
+    "--topic", default="", metavar="TOPIC", help="Check a BatteryState that another node publishes."
 )
 @click.option(
     "--folder",
     type=click.Path(path_type=Path),
     default="/sys/class/power_supply",
     show_default=True,
-    help="Where Linux tells of the battery; it is published as battery_state.",
+    help="Folder of the power supplies, or of one battery, in Linux.",
 )
 @click.option(
     "--low",
@@ -181,7 +213,7 @@ def obstacles(
     default=20.0,
     show_default=True,
     metavar="PERCENT",
-    help="WARN below.",
+    help="WARN below this charge.",
 )
 @click.option(
     "--critical",
@@ -189,7 +221,7 @@ def obstacles(
     default=10.0,
     show_default=True,
     metavar="PERCENT",
-    help="ERROR below.",
+    help="ERROR below this charge.",
 )
 @click.option(
     "--volts",
@@ -197,7 +229,7 @@ def obstacles(
     type=Number(),
     default=(0.0, 0.0),
     metavar="EMPTY FULL",
-    help="For batteries that tell their voltage alone.",
+    help="Voltages, for batteries that report no charge.",
 )
 @click.option(
     "--period",
@@ -205,7 +237,7 @@ def obstacles(
     default=5.0,
     show_default=True,
     metavar="S",
-    help="Of readings.",
+    help="Time between two readings.",
 )
 def battery(
     namespace: str,
@@ -216,9 +248,9 @@ def battery(
     volts: tuple[float, float],
     period: float,
 ) -> None:
-    """Publish the charge of this machine's battery.
+    """Publish the state of this machine's battery, or check a battery that another node publishes (--topic).
 
-    Or judge that of another node, with --topic. On /diagnostics it is WARN and ERROR when it is low.
+    A low battery is WARN or ERROR on /diagnostics.
 
     Topics out: battery_state (BatteryState; not with --topic).
     """
@@ -242,27 +274,39 @@ def battery(
     type=click.Choice([str(each) for each in BAUDS]),
     default="9600",
     show_default=True,
-    help="Of a serial device.",
+    help="Baud rate of a serial device.",
 )
-@click.option("--frame", default="gps", show_default=True, help="Of the antenna.")
+@click.option("--frame", default="gps", show_default=True, help="Frame of the antenna.")
 @click.option(
     "--pace",
     type=Number(0, 60),
     default=1.0,
     show_default=True,
     metavar="S",
-    help="Between two positions of a file.",
+    help="Time between two positions of a file.",
 )
 def gps(namespace: str, source: str, baud: str, frame: str, pace: float) -> None:
-    """Publish the positions a receiver tells in NMEA 0183.
+    """Publish the positions of an NMEA 0183 receiver.
 
     SOURCE is a serial device, tcp://HOST:PORT or a recorded file. Topics out: fix (NavSatFix).
     """
     from robot_client.services.gps_node import Gps
     from robot_client.services.node_runner import run
 
-    opened = opener(source, int(baud), pace)
-    run("gps", namespace, lambda node: Gps(node, source, opened, frame))
+    open_source = source_factory(source, int(baud), pace)
+    run("gps", namespace, lambda node: Gps(node, source, open_source, frame))
+
+
+def _where_option(function: Any) -> Any:
+    """The option that says where a function runs."""
+    return click.option(
+        "--where",
+        type=click.Choice(["auto", "here", "cloud"]),
+        default="auto",
+        show_default=True,
+        help="Where images are searched: auto by the robot's settings and the state of its computer, always here, "
+        "or by the relay's workers as long as they answer.",
+    )(function)
 
 
 @service(
@@ -270,7 +314,7 @@ def gps(namespace: str, source: str, baud: str, frame: str, pace: float) -> None
     "--size 0.16 --view 75",
     "--size 0.1 --dictionary APRILTAG_36h11 --image /front/image_raw/compressed --compressed",
 )
-@camera
+@camera_options
 @click.option(
     "--size",
     type=Number(0.001, 100),
@@ -278,9 +322,8 @@ def gps(namespace: str, source: str, baud: str, frame: str, pace: float) -> None
     metavar="M",
     help="Side of the markers' black square.",
 )
-@click.option(
-    "--dictionary", default="4X4_50", show_default=True, help="Family of markers, as OpenCV names it."
-)
+@click.option("--dictionary", default="4X4_50", show_default=True, help="Marker dictionary of OpenCV.")
+@_where_option
 def markers(
     namespace: str,
     image: str,
@@ -289,43 +332,46 @@ def markers(
     view: float | None,
     size: float,
     dictionary: str,
+    where: Where,
 ) -> None:
-    """Say which ArUco markers a camera sees, and where.
+    """Publish the ArUco markers a camera sees, with their poses.
 
     Topics out: markers (MarkerArray, id is the marker's), markers/seen (String: JSON with id, distance, bearing).
     """
     from robot_client.services.markers import DICTIONARIES
     from robot_client.services.markers_node import Markers
     from robot_client.services.node_runner import run
+    from robot_client.services.placement import RunOptions
 
     if dictionary not in DICTIONARIES:
-        raise click.BadParameter(f"'{dictionary}' is not known; these are: {', '.join(DICTIONARIES)}")
-    asked = _asked(image, compressed, info, view)
-    run("markers", namespace, lambda node: Markers(node, asked, dictionary, size))
+        raise click.BadParameter(f"'{dictionary}' is not a dictionary; known are: {', '.join(DICTIONARIES)}")
+    request = _image_request(image, compressed, info, view)
+    run("markers", namespace, lambda node: Markers(node, request, dictionary, size, RunOptions(where)))
 
 
 @service("--people people/", "--people people/ --view 75 --rate 2")
-@camera
+@camera_options
 @click.option(
     "--people",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Pictures of who is to be recognised: a file or a folder a person, of its name.",
+    help="Images of known persons: for each, one file or one folder, named after the person.",
 )
 @click.option(
-    "--alike",
+    "--similarity",
     type=Number(0, 1),
     default=0.7,
     show_default=True,
-    help="How alike a face must be to a person's picture.",
+    help="Least similarity of a recognised face.",
 )
 @click.option(
     "--rate",
     type=Number(0.1, 30),
     default=5.0,
     show_default=True,
-    help="Pictures per second that are looked at, at most.",
+    help="Most images per second that are processed.",
 )
+@_where_option
 def faces(
     namespace: str,
     image: str,
@@ -333,21 +379,23 @@ def faces(
     info: str,
     view: float | None,
     people: Path | None,
-    alike: float,
+    similarity: float,
     rate: float,
+    where: Where,
 ) -> None:
-    """Say which faces a camera sees, where, and whose they are.
+    """Publish the faces a camera sees, with positions and names.
 
     Topics out: faces (MarkerArray), faces/seen (String: JSON with name, distance, bearing).
     """
-    from robot_client.services.faces import Finder, KnownFaces, read_people
+    from robot_client.services.faces import FaceFinder, KnownFaces, read_people
     from robot_client.services.faces_node import Faces
     from robot_client.services.node_runner import run
+    from robot_client.services.placement import RunOptions
 
-    finder = Finder()
-    known = read_people(people, finder, alike) if people else KnownFaces(alike)
-    asked = _asked(image, compressed, info, view)
-    run("faces", namespace, lambda node: Faces(node, asked, finder, known, rate))
+    finder = FaceFinder()
+    known = read_people(people, finder, similarity) if people else KnownFaces(similarity)
+    request = _image_request(image, compressed, info, view)
+    run("faces", namespace, lambda node: Faces(node, request, finder, known, rate, RunOptions(where)))
 
 
 @service("", "--voice de --speed 140", "--out said.wav")
@@ -366,22 +414,123 @@ def faces(
 @click.option(
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="Write everything into this WAV file instead of playing it; an old one is replaced.",
+    help="Write all sound to this WAV file instead of playing it; an existing file is replaced.",
 )
 def speech(namespace: str, voice: str, speed: int, volume: int, out: Path | None) -> None:
-    """Say what comes on the topic say (String).
+    """Speak the texts of the topic say (String), one after the other.
 
-    One text after the other, never two at a time. Topics out: speaking (Bool), said (String).
-    Service: say/hush (Trigger), which silences it.
+    Topics out: speaking (Bool), said (String: each text that was spoken completely). Service: say/cancel (Trigger),
+    which stops the speech and drops waiting texts.
     """
-    from robot_client.services.espeak import Espeak
     from robot_client.services.node_runner import run
-    from robot_client.services.speech import WavFile, player
+    from robot_client.services.speech import Espeak, WavFile, player
     from robot_client.services.speech_node import Speech
 
-    speaker = Espeak(voice, speed, volume)
-    output = WavFile(out, speaker.rate) if out else player()
-    run("speech", namespace, lambda node: Speech(node, speaker, output))
+    synthesizer = Espeak(voice, speed, volume)
+    output = WavFile(out, synthesizer.rate) if out else player()
+    run("speech", namespace, lambda node: Speech(node, synthesizer, output))
+
+
+@service("", "--radius 0.25 --max-speed 0.3", "--scan /front/scan --depth ''")
+@click.option(
+    "--scan", default="/scan", show_default=True, metavar="TOPIC", help="LaserScan; empty for none."
+)
+@click.option(
+    "--depth",
+    default="/camera/depth/image_rect_raw",
+    show_default=True,
+    metavar="TOPIC",
+    help="Depth image (16UC1, 32FC1) of a level camera; empty for none.",
+)
+@click.option(
+    "--info",
+    default="",
+    metavar="TOPIC",
+    help="Its CameraInfo. Default: camera_info in the namespace of the images.",
+)
+@click.option(
+    "--shortest-depth",
+    type=Number(0, 2),
+    default=0.5,
+    show_default=True,
+    metavar="M",
+    help="Shortest range of the depth camera: nothing nearer is cleared by pixels without a measurement.",
+)
+@click.option("--map", "map_topic", default="/map", show_default=True, metavar="TOPIC", help="OccupancyGrid.")
+@click.option(
+    "--base-frame", default="base_link", show_default=True, metavar="FRAME", help="The robot's frame."
+)
+@click.option(
+    "--localiser-timeout",
+    type=Number(0.3, 60),
+    default=3.0,
+    show_default=True,
+    metavar="S",
+    help="Seconds that the localiser's transform on /tf may be late; then the robot stands.",
+)
+@click.option(
+    "--radius", type=Number(0.01, 5), default=0.2, show_default=True, metavar="M", help="Radius of the robot."
+)
+@click.option(
+    "--inflation",
+    type=Number(0.02, 10),
+    default=0.5,
+    show_default=True,
+    metavar="M",
+    help="Distance from obstacles that the robot keeps where there is room.",
+)
+@click.option(
+    "--max-speed", type=Number(0.1, 5), default=0.4, show_default=True, metavar="M/S", help="Maximum speed."
+)
+@click.option(
+    "--max-turn",
+    type=Number(0.2, 10),
+    default=1.2,
+    show_default=True,
+    metavar="RAD/S",
+    help="Maximum turn rate.",
+)
+def navigator(
+    namespace: str,
+    scan: str,
+    depth: str,
+    info: str,
+    shortest_depth: float,
+    map_topic: str,
+    base_frame: str,
+    localiser_timeout: float,
+    radius: float,
+    inflation: float,
+    max_speed: float,
+    max_turn: float,
+) -> None:
+    """Drive to goals around what scanner and depth camera see, with the interface of Nav2.
+
+    Action: navigate_to_pose (nav2_msgs). Topics in: goal_pose (PoseStamped), the map, /tf. Topics out: cmd_vel (Twist),
+    plan (Path), local_costmap/costmap and global_costmap/costmap (OccupancyGrid).
+    """
+    if not (scan or depth):
+        raise click.BadParameter("--scan and --depth are both empty; a navigator needs a sensor")
+    if inflation < radius:
+        raise click.BadParameter(f"--inflation ({inflation:g}) must not be less than --radius ({radius:g})")
+    from robot_client.services.node_runner import run
+
+    try:
+        from robot_client.navigation.node import NavigatorNode, NavigatorTopics
+    except ModuleNotFoundError as error:
+        if error.name not in ("nav2_msgs", "tf2_msgs"):
+            raise
+        raise click.ClickException(
+            f"{error.name} is missing; install it, or run 'scripts/setup.sh interfaces'"
+        ) from None
+    from robot_client.navigation.navigator import NavigatorSettings
+    from robot_client.navigation.pursuit import DriveLimits
+
+    info = info or f"{depth.rpartition('/')[0]}/camera_info"
+    topics = NavigatorTopics(scan, depth, info, map_topic, base_frame, shortest_depth)
+    limits = DriveLimits(max_speed, max_turn)
+    settings = NavigatorSettings(topics.sensors(), radius, inflation, limits, localiser_timeout)
+    run("navigator", namespace, lambda node: NavigatorNode(node, topics, settings))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What all services share in the graph: a node, the loop that serves it, its end by a signal, and ``/diagnostics``."""
+"""Runs the ROS node of a service until a signal, and publishes its ``/diagnostics``."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ from robot_client.ros_log import ensure_log_folder
 from robot_client.services.health import Level, ServiceFinding
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""For states: who comes late is told the last one."""
+"""For states: late subscribers get the last one."""
 
-TOLD_EVERY = 1.0
-"""Seconds between two findings on ``/diagnostics``, when nothing changes."""
+REPORT_SECONDS = 1.0
+"""Interval of ``/diagnostics`` without changes, seconds."""
 
-_LONGEST_TURN = 0.1
-"""Seconds; how long a signal may wait to be seen."""
+_SPIN_SECONDS = 0.1
+"""Seconds until a signal is noticed, at most."""
 
 
 class Service(Protocol):
-    """What a service is in the graph, made with its node."""
+    """A service, created with its node."""
 
     def finding(self) -> ServiceFinding:
-        """How it is; asked often."""
+        """Its state; called often."""
 
     def close(self) -> None:
-        """Let go of what it has beside the node."""
+        """Release resources other than the node."""
 
 
 def run(name: str, namespace: str, build: Callable[[Any], Service]) -> None:
-    """Serve one service until SIGINT or SIGTERM. Prints READY when its topics are there.
+    """Run a service until SIGINT or SIGTERM. Prints READY when its topics exist.
 
-    Like the daemon's nodes it shares no memory with others, so that nobody is held up when it freezes.
+    Like the daemon's nodes it uses no shared memory, so that a frozen service blocks no other node.
 
     :param name: of the node
     :param namespace: before all its names; empty for none
-    :param build: makes the service
-    :raises click.BadParameter: there can be no such namespace
-    :raises Invalid: a topic can't have such a name
-    :raises Unavailable: ROS 2 does not start, or the service lacks something
+    :param build: creates the service
+    :raises click.BadParameter: invalid namespace
+    :raises Invalid: invalid topic name
+    :raises Unavailable: ROS 2 does not start, or the service cannot
     """
     with _stop_requested() as stop, _node(name, namespace) as (node, executor):
         try:
@@ -60,42 +60,42 @@ def run(name: str, namespace: str, build: Callable[[Any], Service]) -> None:
             raise Invalid(in_one_line(error)) from None
         with contextlib.closing(service):
             health = HealthReporter(node, service.finding)
-            health.tell()
+            health.report()
             click.echo("READY")
             while not stop:
-                executor.spin_once(timeout_sec=_LONGEST_TURN)
-                health.look()
+                executor.spin_once(timeout_sec=_SPIN_SECONDS)
+                health.report_if_due()
 
 
 class HealthReporter:
-    """Puts findings on ``/diagnostics``: when the level changes at once, else every :data:`TOLD_EVERY` seconds."""
+    """Publishes findings on ``/diagnostics``: at once when the level changes, else every :data:`REPORT_SECONDS`."""
 
     def __init__(self, node: Any, finding: Callable[[], ServiceFinding]) -> None:
         self._node = node
         self._finding = finding
         self._name = node.get_fully_qualified_name().lstrip("/")
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._told = Level.STALE
+        self._reported_level = Level.STALE
         self._due = True
-        node.create_timer(TOLD_EVERY, self._mark)
+        node.create_timer(REPORT_SECONDS, self._set_due)
 
-    def look(self) -> None:
-        """Tell what is new, or due."""
+    def report_if_due(self) -> None:
+        """Publish the state if its level has changed or a report is due."""
         found = self._finding()
-        if self._due or found.level is not self._told:
-            self._tell(found)
+        if self._due or found.level is not self._reported_level:
+            self._publish(found)
 
-    def tell(self) -> None:
-        """Tell how it is now."""
-        self._tell(self._finding())
+    def report(self) -> None:
+        """Publish the state now."""
+        self._publish(self._finding())
 
-    def _mark(self) -> None:
+    def _set_due(self) -> None:
         self._due = True
 
-    def _tell(self, found: ServiceFinding) -> None:
-        if found.level is not self._told and found.level is not Level.OK:
+    def _publish(self, found: ServiceFinding) -> None:
+        if found.level is not self._reported_level and found.level is not Level.OK:
             self._node.get_logger().warning(found.message)
-        self._told, self._due = found.level, False
+        self._reported_level, self._due = found.level, False
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [
@@ -147,13 +147,13 @@ class _StopRequested:
 
 @contextlib.contextmanager
 def _stop_requested() -> Iterator[_StopRequested]:
-    """Signals only set a mark: the loop ends by itself, at a place where all is in order."""
+    """Signals only set a flag; the loop ends at a safe point."""
     stop = _StopRequested()
 
-    def note(*_: object) -> None:
+    def request_stop(*_: object) -> None:
         stop.requested = True
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
     finally:

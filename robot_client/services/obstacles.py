@@ -1,4 +1,4 @@
-"""What is nearest in each direction, from a scan or a picture of depth. Pure."""
+"""Finds the nearest obstacle in each direction, from a scan or a depth image. Pure."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ import numpy as np
 import numpy.typing as npt
 
 from relay_protocol.errors import Invalid
-from robot_client.camera.messages import Image
+from robot_client.camera.images import ImageMessage
 from robot_client.services.camera_model import CameraModel
 from robot_client.services.health import Level, ServiceFinding
 
 Floats = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
 
-MOST_SECTORS = 360
-MOST_RAYS = 100_000
-AGREE = 20
-"""Pixels of depth that must be as near before it counts: single ones are noise."""
-LET_GO = 1.1
-"""What was near is near until it is so many times as far as the threshold."""
+MAX_SECTORS = 360
+MAX_RAYS = 100_000
+MIN_PIXELS = 20
+"""Depth pixels that must agree on an obstacle, because single ones are noise."""
+HYSTERESIS = 1.1
+"""An obstacle stays near until it is this many times as far as the threshold."""
 
 _WHOLE_TURN = math.tau * 0.99
 
 
 class Scan(NamedTuple):
-    """One turn of a scanner, or a part of one.
+    """One scan.
 
     :ivar ranges: metres by ray
     :ivar begin: radians of the first ray from straight ahead, counter-clockwise
-    :ivar step: radians from one ray to the next; less than zero for clockwise
-    :ivar least: metres; what is nearer is there, and counts as so near
-    :ivar most: metres; what is farther counts as nothing
+    :ivar step: radians from one ray to the next; negative for clockwise
+    :ivar least: least range, metres; nearer obstacles count as this far
+    :ivar most: largest range, metres; farther obstacles do not count
     """
 
     ranges: Floats
@@ -44,9 +44,9 @@ class Scan(NamedTuple):
 
 
 class ObstaclePosition(NamedTuple):
-    """Where an obstacle is.
+    """Position of an obstacle.
 
-    :ivar distance: metres, along the floor
+    :ivar distance: along the floor, metres
     :ivar bearing: radians from straight ahead, counter-clockwise
     """
 
@@ -57,9 +57,9 @@ class ObstaclePosition(NamedTuple):
 class Sectors(NamedTuple):
     """The nearest obstacle of each sector.
 
-    :ivar first: radians of the middle of the first sector
-    :ivar width: radians of each
-    :ivar places: by sector; ``None`` where nothing is
+    :ivar first: centre of the first sector, radians
+    :ivar width: width of each, radians
+    :ivar places: by sector; ``None`` without an obstacle
     """
 
     first: float
@@ -73,11 +73,11 @@ class Sectors(NamedTuple):
 
 
 class Band(NamedTuple):
-    """Which heights are in the robot's way, metres over the floor.
+    """Heights that count as obstacles, metres above the floor.
 
-    :ivar camera: height of the camera, which looks level
-    :ivar low: what is lower the robot drives over
-    :ivar high: what is higher it drives under
+    :ivar camera: height of the camera, which must be level
+    :ivar low: lower objects are driven over
+    :ivar high: higher objects are driven under
     """
 
     camera: float = 0.2
@@ -88,20 +88,20 @@ class Band(NamedTuple):
 def of_scan(scan: Scan, count: int) -> Sectors:
     """The nearest obstacle of each sector of a scan.
 
-    Of a whole turn one sector lies straight ahead; of less the field of view is divided evenly. What is too near
-    to be measured (REP 117: ``-inf``, or less than the least) is as near as the least; zero, NaN and other numbers
-    below zero were not measured.
+    A full-circle scan has one sector straight ahead; otherwise the field of view is divided evenly. Ranges too near to
+    measure (REP 117: ``-inf``, or below the least) count as the least; zero, NaN and negative numbers mean no
+    measurement.
 
     :param count: how many sectors
-    :raises Invalid: the scan makes no sense, or not one ray says what is there
+    :raises Invalid: the scan is invalid, or no ray has a measurement
     """
     rays = len(scan.ranges)
-    if not 0 < rays <= MOST_RAYS:
-        raise Invalid(f"a scan of {rays} rays; there are 1 to {MOST_RAYS}")
+    if not 0 < rays <= MAX_RAYS:
+        raise Invalid(f"a scan of {rays} rays; 1 to {MAX_RAYS} are supported")
     if not (math.isfinite(scan.begin) and 0 < abs(scan.step) <= math.tau):
-        raise Invalid(f"a scan from {scan.begin} in steps of {scan.step} radians makes no sense")
+        raise Invalid(f"a scan from {scan.begin} in steps of {scan.step} radians is invalid")
     if not 0 <= scan.least < scan.most:
-        raise Invalid(f"a scan of what is {scan.least} to {scan.most} m away makes no sense")
+        raise Invalid(f"a scan of what is {scan.least} to {scan.most} m is invalid")
     bearings: Floats = scan.begin + scan.step * np.arange(rays, dtype=np.float64)
     if rays * abs(scan.step) >= _WHOLE_TURN:
         width = math.tau / count
@@ -114,36 +114,36 @@ def of_scan(scan: Scan, count: int) -> Sectors:
         index = ((bearings - edges[0]) / width).astype(int).clip(0, count - 1)
     with np.errstate(invalid="ignore"):
         known = (scan.ranges > 0) | np.isneginf(scan.ranges)
-        met = known & (scan.ranges <= scan.most) & (scan.ranges < np.inf)
+        hit = known & (scan.ranges <= scan.most) & (scan.ranges < np.inf)
     if not known.any():
-        raise Invalid(f"not one of the {rays} rays of the scan has measured anything")
-    distances = np.maximum(scan.ranges[met], scan.least)
-    return Sectors(first, width, _nearest(distances, bearings[met], index[met], count))
+        raise Invalid(f"none of the {rays} rays of the scan has a measurement")
+    distances = np.maximum(scan.ranges[hit], scan.least)
+    return Sectors(first, width, _nearest(distances, bearings[hit], index[hit], count))
 
 
-def of_depth(depth: Depth, lens: CameraModel, count: int, band: Band) -> Sectors:
-    """The nearest obstacle of each sector of a picture of depth; floor and ceiling are left out.
+def of_depth(depth: Depth, model: CameraModel, count: int, band: Band) -> Sectors:
+    """The nearest obstacle of each sector of a depth image, without floor and ceiling.
 
-    What is too near to be measured (REP 117: ``-inf``) is where the camera is: at its height, and no metres away.
+    Depths too near to measure (REP 117: ``-inf``) count as 0 m away at the height of the camera.
 
-    :param depth: metres along the optical axis, shape (height, width), NaN where nothing was measured
-    :param lens: of this picture
+    :param depth: metres along the optical axis, shape (height, width), NaN without a measurement
+    :param model: camera model for this image size
     :param count: how many sectors
-    :raises Invalid: fewer pixels than :data:`AGREE` say what is there
+    :raises Invalid: fewer than :data:`MIN_PIXELS` pixels have a measurement
     """
     height, width = depth.shape
     # Bearings grow to the left, columns to the right.
-    aside: Floats = (lens.cx - np.arange(width, dtype=np.float64)) / lens.fx
+    aside: Floats = (model.cx - np.arange(width, dtype=np.float64)) / model.fx
     bearings = np.arctan(aside)
-    left, right = math.atan((lens.cx + 0.5) / lens.fx), math.atan((lens.cx - width + 0.5) / lens.fx)
+    left, right = math.atan((model.cx + 0.5) / model.fx), math.atan((model.cx - width + 0.5) / model.fx)
     sector = (left - right) / count
-    lifts = ((lens.cy - np.arange(height)) / lens.fy).astype(np.float32)
+    lifts = ((model.cy - np.arange(height)) / model.fy).astype(np.float32)
     with np.errstate(invalid="ignore"):
         touching = np.isneginf(depth)
         known = (depth > 0) | touching
-        if np.count_nonzero(known) < AGREE:
+        if np.count_nonzero(known) < MIN_PIXELS:
             raise Invalid(
-                f"fewer than {AGREE} pixels of the {width}×{height} of depth have measured anything"
+                f"fewer than {MIN_PIXELS} pixels of the {width}×{height} depth image have a measurement"
             )
         depth = np.where(touching, np.float32(0), depth)
         heights = band.camera + depth * lifts[:, None]
@@ -159,34 +159,32 @@ def of_depth(depth: Depth, lens: CameraModel, count: int, band: Band) -> Sectors
 
 
 def _agreed(distances: Depth, bearings: Floats) -> ObstaclePosition | None:
-    """The nearest place that enough pixels agree on.
+    """The nearest position on which enough pixels agree.
 
-    :param distances: metres by row and column, infinite where nothing is
+    :param distances: metres by row and column, infinite without an obstacle
     :param bearings: of the columns
     """
-    if distances.size < AGREE:
+    if distances.size < MIN_PIXELS:
         return None
-    which = int(np.argpartition(distances, AGREE - 1, axis=None)[AGREE - 1])
+    which = int(np.argpartition(distances, MIN_PIXELS - 1, axis=None)[MIN_PIXELS - 1])
     row, column = divmod(which, distances.shape[1])
     distance = float(distances[row, column])
     return ObstaclePosition(distance, float(bearings[column])) if math.isfinite(distance) else None
 
 
-def metres(picture: Image) -> Depth:
-    """Depth of a picture (REP 118): ``16UC1`` are millimetres, ``32FC1`` metres.
+def metres(image: ImageMessage) -> Depth:
+    """Depth of an image (REP 118): ``16UC1`` are millimetres, ``32FC1`` metres.
 
     :raises Invalid: another encoding, or fewer bytes than its size takes
     """
     kinds = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-    if picture.encoding not in kinds:
-        raise Invalid(f"a picture of encoding '{picture.encoding}' has no depth; 16UC1 and 32FC1 have")
-    kind = np.dtype(kinds[picture.encoding]).newbyteorder(">" if picture.big_endian else "<")
-    if picture.step < picture.width * kind.itemsize or len(picture.pixels) < picture.step * picture.height:
-        raise Invalid(
-            f"{picture.width}×{picture.height} of {picture.encoding} take more bytes than there are"
-        )
+    if image.encoding not in kinds:
+        raise Invalid(f"encoding '{image.encoding}' has no depth; use 16UC1 or 32FC1")
+    kind = np.dtype(kinds[image.encoding]).newbyteorder(">" if image.big_endian else "<")
+    if image.step < image.width * kind.itemsize or len(image.pixels) < image.step * image.height:
+        raise Invalid(f"{image.width}×{image.height} of {image.encoding} needs more bytes than the image has")
     values: npt.NDArray[Any] = np.ndarray(
-        (picture.height, picture.width), kind, picture.pixels, strides=(picture.step, kind.itemsize)
+        (image.height, image.width), kind, image.pixels, strides=(image.step, kind.itemsize)
     )
     depth = values.astype(np.float32)
     if kind.kind == "u":
@@ -211,7 +209,7 @@ def _nearest(
 
 
 class ProximityAlarm:
-    """Whether something is too near; it does not flicker at the threshold.
+    """Whether an obstacle is too near, with hysteresis.
 
     :param threshold: metres
     """
@@ -220,23 +218,22 @@ class ProximityAlarm:
         self._threshold = threshold
         self.near = False
 
-    def see(self, nearest: ObstaclePosition | None, least: float = 0.0) -> bool:
-        """Look at what is nearest now.
+    def update(self, nearest: ObstaclePosition | None, least: float = 0.0) -> bool:
+        """Take the nearest obstacle now.
 
-        :param least: metres, the least that the sensor measures: what is as near as that may be nearer than any
-            threshold, and is near
+        :param least: least range of the sensor, metres; obstacles at this range always count as near
         :returns: whether the answer has changed
         """
         before = self.near
-        limit = self._threshold * (LET_GO if before else 1.0)
+        limit = self._threshold * (HYSTERESIS if before else 1.0)
         self.near = nearest is not None and (nearest.distance < limit or nearest.distance <= least)
         return self.near is not before
 
 
 def finding(near: bool, nearest: ObstaclePosition | None) -> ServiceFinding:
-    """What is said of it."""
+    """Diagnostics."""
     if nearest is None:
-        return ServiceFinding(Level.OK, "nothing in sight")
+        return ServiceFinding(Level.OK, "no obstacle")
     side = "left" if nearest.bearing >= 0 else "right"
     where = f"{nearest.distance:.2f} m away, {abs(math.degrees(nearest.bearing)):.0f}° to the {side}"
     values = {"distance_m": f"{nearest.distance:.3f}", "bearing_deg": f"{math.degrees(nearest.bearing):.1f}"}

@@ -1,7 +1,12 @@
-"""One text after the other, spoken. The voice and where it goes to are handed in."""
+"""Speech: a queue of texts, eSpeak NG to convert them to sound, and outputs of the sound.
+
+Source: eSpeak NG, src/include/espeak-ng/speak_lib.h.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import ctypes.util
 import logging
 import shutil
 import subprocess
@@ -11,27 +16,138 @@ import wave
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
-from relay_protocol.errors import Refused, SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, Refused, SwitchboardError, Unavailable
 from robot_client.services.health import Level, ServiceFinding
 
+_SYNCHRONOUS = 2
+"""The callback is called within ``espeak_Synth``."""
+_DONT_EXIT = 0x8000
+"""Without it the library ends the process when its data is missing."""
+_UTF8 = 1
+_END_PAUSE = 0x1000
+_RATE, _VOLUME = 1, 2
+_CONTINUE, _STOP = 0, 1
+"""Return values of the callback."""
+
+_LONGEST_PATH = 140
+"""The library has 160 bytes for paths of its data, including file names."""
+
+_Callback = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_short), ctypes.c_int, ctypes.c_void_p)
+
+MISSING = (
+    "eSpeak NG is not installed: install 'robot-switchboard[services]', or the system package "
+    "(Debian, Ubuntu: apt install libespeak-ng1)"
+)
+
+
+def find() -> tuple[str, str | None]:
+    """Paths of the library and its data; ``None`` for the default data path.
+
+    :raises Unavailable: not installed
+    """
+    try:
+        import espeakng_loader
+    except ImportError:
+        pass
+    else:
+        return str(espeakng_loader.get_library_path()), str(espeakng_loader.get_data_path())
+    system = ctypes.util.find_library("espeak-ng")
+    if system is None:
+        raise Unavailable(MISSING)
+    return system, None
+
+
+class Espeak:
+    """One voice. The library is global, so create only one, and use it in one thread at a time.
+
+    :param voice: its name or a language: ``en``, ``en-us``, ``de``, ``cs`` …
+    :param words_per_minute: 80 to 450
+    :param volume: 0 to 200; 100 is the default
+    :raises Unavailable: the library is missing, or does not start
+    :raises Invalid: unknown voice
+    :ivar rate: samples per second of the sound
+    """
+
+    def __init__(self, voice: str = "en", words_per_minute: int = 160, volume: int = 100) -> None:
+        file, data = find()
+        try:
+            self._library: Any = ctypes.CDLL(file)
+        except OSError as error:
+            raise Unavailable(f"eSpeak NG can't be loaded: {error}") from None
+        self._library.espeak_Synth.argtypes = [
+            ctypes.c_char_p,
+            ctypes.c_size_t,
+            ctypes.c_uint,
+            ctypes.c_int,
+            ctypes.c_uint,
+            ctypes.c_uint,
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+        ]
+        self._short: tempfile.TemporaryDirectory[str] | None = None
+        if data and len(data.encode()) > _LONGEST_PATH:
+            self._short = tempfile.TemporaryDirectory(prefix="speech-")
+            link = Path(self._short.name, "espeak-ng-data")
+            link.symlink_to(data)
+            data = str(link)
+        path = data.encode() if data else None
+        self.rate: int = self._library.espeak_Initialize(_SYNCHRONOUS, 0, path, _DONT_EXIT)
+        if self.rate <= 0:
+            raise Unavailable(
+                f"eSpeak NG does not start; is its data installed? ({Path(data or '/usr/share')})"
+            )
+        # Referenced, because the library keeps calling it.
+        self._callback = _Callback(self._take)
+        self._library.espeak_SetSynthCallback(self._callback)
+        if not voice or self._library.espeak_SetVoiceByName(voice.encode()) != 0:
+            raise Invalid(f"eSpeak NG has no voice '{voice}'")
+        self._library.espeak_SetParameter(_RATE, words_per_minute, 0)
+        self._library.espeak_SetParameter(_VOLUME, volume, 0)
+        self._parts: list[bytes] = []
+        self._left = 0
+        self._stopped: Callable[[], bool] = lambda: False
+
+    def sound(self, text: str, longest: float, stopped: Callable[[], bool] = lambda: False) -> bytes:
+        """Convert a text to sound: signed 16 bit samples of one channel, in this machine's byte order.
+
+        :param longest: longest sound, seconds
+        :param stopped: polled; true ends it
+        :raises Unavailable: the library fails
+        """
+        encoded = text.replace("\0", " ").encode() + b"\0"
+        self._parts, self._left, self._stopped = [], round(longest * self.rate), stopped
+        failed = self._library.espeak_Synth(encoded, len(encoded), 0, 1, 0, _UTF8 | _END_PAUSE, None, None)
+        parts, self._parts = self._parts, []
+        if failed:
+            raise Unavailable(f"eSpeak NG failed (error {failed})")
+        return b"".join(parts)
+
+    def _take(self, samples: Any, count: int, _: Any) -> int:
+        if samples and count > 0:
+            count = min(count, self._left)
+            self._left -= count
+            self._parts.append(ctypes.string_at(samples, count * ctypes.sizeof(ctypes.c_short)))
+        return _STOP if self._left <= 0 or self._stopped() else _CONTINUE
+
+
 LONGEST_TEXT = 1000
-"""Characters of one text."""
+"""Longest text, characters."""
 LONGEST_SOUND = 120.0
-"""Seconds of one text."""
-WAITING = 10
-"""Texts that may wait."""
+"""Longest sound of a text, seconds."""
+MAX_WAITING = 10
+"""Most waiting texts."""
 
 PLAYERS = ("pw-play", "paplay", "aplay")
 """Programs that play a WAV file: of PipeWire, PulseAudio, ALSA."""
 
 _log = logging.getLogger(__name__)
-_Given = TypeVar("_Given")
+_Argument = TypeVar("_Argument")
 
 
 class SpeechSynthesizer(Protocol):
-    """Makes sound of words; :class:`~robot_client.services.espeak.Espeak` is one."""
+    """Converts text to sound; :class:`~robot_client.services.speech.Espeak`."""
 
     @property
     def rate(self) -> int:
@@ -40,34 +156,34 @@ class SpeechSynthesizer(Protocol):
     def sound(self, text: str, longest: float, stopped: Callable[[], bool]) -> bytes:
         """Signed 16 bit samples of one channel.
 
-        :raises SwitchboardError: it can't
+        :raises SwitchboardError: it fails
         """
 
 
 class Output(Protocol):
-    """Where sound goes to."""
+    """An output of sound."""
 
     def play(self, sound: bytes, rate: int, stopped: threading.Event) -> None:
-        """Return when it has been heard, or ``stopped`` is set.
+        """Play, and return at the end or when ``stopped`` is set.
 
-        :raises Unavailable: it can't be played
+        :raises Unavailable: it fails
         """
 
     def close(self) -> None:
-        """There is no more."""
+        """Close the output."""
 
 
 class WavFile:
-    """Everything in one file, one after the other; it can be played at any time.
+    """Appends all sound to one file, which is valid at any time.
 
-    :param path: written anew
+    :param path: overwritten
     :param rate: samples per second
     :raises Unavailable: it can't be written
     """
 
     def __init__(self, path: Path, rate: int) -> None:
         try:
-            # The file itself is unbuffered, so that what was said is in it.
+            # Unbuffered, so that the file is complete.
             self._file = path.open("wb", buffering=0)
         except OSError as error:
             raise Unavailable(f"{path}: {error.strerror}") from None
@@ -89,7 +205,7 @@ class WavFile:
 
 
 class Player:
-    """A program that plays WAV files on this machine's sound device.
+    """Plays sound by a program of this machine.
 
     :param command: the program, with its arguments; the file's path comes last
     """
@@ -117,23 +233,23 @@ class Player:
             )
         except OSError as error:
             raise Unavailable(f"{name}: {error.strerror}") from None
-        # A device that takes nothing would be waited for for ever.
+        # A blocked sound device would block the player for ever.
         waited, most = 0.0, 2 * seconds + 10
         while True:
             try:
-                _, said = process.communicate(timeout=0.1)
+                _, errors = process.communicate(timeout=0.1)
                 break
             except subprocess.TimeoutExpired:
                 waited += 0.1
                 if stopped.is_set() or waited > most:
                     process.kill()
         if process.returncode and not stopped.is_set():
-            words = said.decode(errors="replace").strip().splitlines()
-            why = words[-1][:200] if words else f"it ended with {process.returncode}"
+            lines = errors.decode(errors="replace").strip().splitlines()
+            why = lines[-1][:200] if lines else f"it ended with {process.returncode}"
             raise Unavailable(f"{name} could not play it: {why}")
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """See :class:`Output`."""
 
 
 def _describe(file: wave.Wave_write, rate: int) -> None:
@@ -157,81 +273,82 @@ def player(which: Callable[[str], str | None] = shutil.which) -> Player:
 
 
 class SpeechStatus(NamedTuple):
-    """What becomes of a text.
+    """Progress of the speech.
 
-    :ivar speaking: whether anything is being said now
-    :ivar said: the text that has been said to its end
+    :ivar speaking: whether a text is being spoken
+    :ivar completed: the text that was spoken completely
     """
 
     speaking: bool
-    said: str | None = None
+    completed: str | None = None
 
 
 class SpeechQueue:
-    """Says texts in their order, in a thread of its own; never two at a time.
+    """Speaks one text after the other, in a thread of its own.
 
-    Whatever fails is told by :meth:`finding`, and what was not foreseen is logged with its traceback; the next text
-    is said all the same.
+    Failures are reported by :meth:`finding`, unexpected ones are logged with a traceback; the next text is spoken.
 
-    :param tell: called in that thread
+    :param report: called in that thread
     """
 
     def __init__(
-        self, voice: SpeechSynthesizer, output: Output, tell: Callable[[SpeechStatus], None]
+        self, voice: SpeechSynthesizer, output: Output, report: Callable[[SpeechStatus], None]
     ) -> None:
         self._voice = voice
         self._output = output
-        self._tell = tell
+        self._report = report
         self._texts: deque[str] = deque()
         self._changed = threading.Condition()
-        """Of all that follows."""
-        self._hush = threading.Event()
+        """Guards the attributes below."""
+        self._cancelled = threading.Event()
         self._ending = False
         self._speaking = False
-        self._trouble = ""
+        self._problem = ""
         self._refused = 0
         self._thread = threading.Thread(target=self._run, name="speech", daemon=True)
         self._thread.start()
 
-    def say(self, text: str) -> None:
-        """Say it when it is its turn.
+    def add(self, text: str) -> None:
+        """Queue a text.
 
-        :raises Refused: it is too long, or too many wait
+        :raises Refused: it is too long, or too many are waiting
         """
         words = " ".join(text.split())
         with self._changed:
             if len(words) > LONGEST_TEXT:
                 self._refused += 1
-                raise Refused(f"a text of {len(words)} characters is too long; {LONGEST_TEXT} are the most")
-            if len(self._texts) >= WAITING:
+                raise Refused(
+                    f"a text of {len(words)} characters is too long; at most {LONGEST_TEXT} are spoken"
+                )
+            if len(self._texts) >= MAX_WAITING:
                 self._refused += 1
-                raise Refused(f"{WAITING} texts wait already; this one is not said")
+                raise Refused(f"{MAX_WAITING} texts are waiting; this one is dropped")
             if words:
                 self._texts.append(words)
                 self._changed.notify()
 
-    def hush(self) -> int:
-        """Be silent at once, and forget what waits.
+    def cancel(self) -> int:
+        """Stop speaking, and drop the waiting texts.
 
-        :returns: how many texts are not said, or not to their end
+        :returns: number of texts that were not spoken completely
         """
         with self._changed:
-            forgotten = len(self._texts) + self._speaking
+            cancelled = len(self._texts) + self._speaking
             self._texts.clear()
-            self._hush.set()
-        return forgotten
+            self._cancelled.set()
+        return cancelled
 
     def finding(self) -> ServiceFinding:
-        """How it is."""
+        """State of the speech."""
         with self._changed:
             values = {"waiting": str(len(self._texts)), "refused": str(self._refused)}
-            if self._trouble:
-                return ServiceFinding(Level.ERROR, self._trouble, values)
+            if self._problem:
+                return ServiceFinding(Level.ERROR, self._problem, values)
             return ServiceFinding(Level.OK, "speaking" if self._speaking else "silent", values)
 
     def close(self) -> None:
-        """Be silent for good."""
-        self.hush()
+        """Stop speaking, and end the thread."""
+        self.cancel()
         with self._changed:
             self._ending = True
             self._changed.notify()
@@ -240,19 +357,20 @@ class SpeechQueue:
 
     def _run(self) -> None:
         while (text := self._next()) is not None:
-            untold = self._told(SpeechStatus(speaking=True))
-            trouble = "the text was not said to its end"
+            report_failure = self._report_status(SpeechStatus(speaking=True))
+            problem = "the text was not spoken completely"
             try:
-                trouble = _tried("saying a text", self._say, text)
+                problem = _failure_of("speaking a text", self._speak, text)
             finally:
                 with self._changed:
                     self._speaking = False
-                    self._trouble = trouble or untold
-                    said = not trouble and not self._hush.is_set()
-            untold = self._told(SpeechStatus(speaking=False, said=text if said else None))
-            if untold:
+                    self._problem = problem or report_failure
+                    completed = not problem and not self._cancelled.is_set()
+            status = SpeechStatus(speaking=False, completed=text if completed else None)
+            report_failure = self._report_status(status)
+            if report_failure:
                 with self._changed:
-                    self._trouble = self._trouble or untold
+                    self._problem = self._problem or report_failure
 
     def _next(self) -> str | None:
         with self._changed:
@@ -260,27 +378,31 @@ class SpeechQueue:
                 if self._ending:
                     return None
                 self._changed.wait()
-            self._hush.clear()
+            self._cancelled.clear()
             self._speaking = True
             return self._texts.popleft()
 
-    def _told(self, told: SpeechStatus) -> str:
-        """:returns: why it could not be told"""
-        return _tried("telling what is said", self._tell, told)
+    def _report_status(self, status: SpeechStatus) -> str:
+        """:returns: why it failed; empty when it worked"""
+        return _failure_of("reporting speech", self._report, status)
 
-    def _say(self, text: str) -> None:
-        sound = self._voice.sound(text, LONGEST_SOUND, self._hush.is_set)
-        if not self._hush.is_set():
-            self._output.play(sound, self._voice.rate, self._hush)
+    def _speak(self, text: str) -> None:
+        sound = self._voice.sound(text, LONGEST_SOUND, self._cancelled.is_set)
+        if not self._cancelled.is_set():
+            self._output.play(sound, self._voice.rate, self._cancelled)
 
 
-def _tried(what: str, action: Callable[[_Given], None], given: _Given) -> str:
-    """:returns: why it could not be done; empty when it was"""
+def _failure_of(what: str, action: Callable[[_Argument], None], argument: _Argument) -> str:
+    """Run an action.
+
+    :param what: its name, for the log
+    :returns: why it failed; empty when it worked
+    """
     try:
-        action(given)
+        action(argument)
     except SwitchboardError as error:
         return str(error)
-    except Exception as error:  # of a voice, an output or a listener: none of them may end the thread
+    except Exception as error:  # no voice, output or callback may end the thread
         _log.exception("%s failed", what)
         return f"{what} failed: {type(error).__name__}: {error}"
     return ""

@@ -1,4 +1,4 @@
-"""The service ``speech`` in the graph."""
+"""ROS node of the service ``speech``."""
 
 from __future__ import annotations
 
@@ -10,43 +10,43 @@ from std_srvs.srv import Trigger
 from relay_protocol.errors import Refused
 from robot_client.services.health import ServiceFinding
 from robot_client.services.node_runner import LATCHED
-from robot_client.services.speech import WAITING, Output, SpeechQueue, SpeechStatus, SpeechSynthesizer
+from robot_client.services.speech import MAX_WAITING, Output, SpeechQueue, SpeechStatus, SpeechSynthesizer
 
 
 class Speech:
-    """Says what comes on the topic ``say``."""
+    """Speaks the texts of the topic ``say``."""
 
     def __init__(self, node: Any, voice: SpeechSynthesizer, output: Output) -> None:
         self._node = node
         self._speaking = node.create_publisher(Bool, "speaking", LATCHED)
-        self._said = node.create_publisher(String, "said", WAITING)
+        self._completed = node.create_publisher(String, "said", MAX_WAITING)
         self._speaking.publish(Bool(data=False))
-        self._speaker = SpeechQueue(voice, output, self._tell)
-        node.create_subscription(String, "say", self._say, 2 * WAITING)
-        node.create_service(Trigger, "say/hush", self._hush)
+        self._queue = SpeechQueue(voice, output, self._publish_status)
+        node.create_subscription(String, "say", self._on_text, 2 * MAX_WAITING)
+        node.create_service(Trigger, "say/cancel", self._cancel)
 
     def finding(self) -> ServiceFinding:
-        """What it does."""
-        return self._speaker.finding()
+        """State of the speech."""
+        return self._queue.finding()
 
     def close(self) -> None:
-        """Be silent."""
-        self._speaker.close()
+        """Stop speaking."""
+        self._queue.close()
 
-    def _say(self, message: String) -> None:
+    def _on_text(self, message: String) -> None:
         try:
-            self._speaker.say(message.data)
+            self._queue.add(message.data)
         except Refused as error:
             self._node.get_logger().warning(str(error))
 
-    def _hush(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        forgotten = self._speaker.hush()
+    def _cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        cancelled = self._queue.cancel()
         response.success = True
-        response.message = f"{forgotten} texts are not said" if forgotten else "nothing was to be said"
+        response.message = f"{cancelled} texts cancelled" if cancelled else "no text was waiting"
         return response
 
-    def _tell(self, told: SpeechStatus) -> None:
-        """In the speaker's thread: publishers may be used in any."""
-        self._speaking.publish(Bool(data=told.speaking))
-        if told.said is not None:
-            self._said.publish(String(data=told.said))
+    def _publish_status(self, status: SpeechStatus) -> None:
+        """Runs in the speech thread; publishers are thread-safe."""
+        self._speaking.publish(Bool(data=status.speaking))
+        if status.completed is not None:
+            self._completed.publish(String(data=status.completed))

@@ -1,4 +1,4 @@
-"""Chargers in the camera's picture: a plate on a wall with an ArUco marker on it, drawn by columns as the walls are."""
+"""Draws chargers into the camera's image: plates with ArUco markers on walls, by columns like the walls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robot_client.sim.world import Charger, Floats, Hits, Pose, World
 MARKER_SIDE = 0.4
 """Metres, of the marker's black square."""
 SIDE = 0.6
-"""Metres, of the plate: the marker has so much white around it."""
+"""Metres, of the plate: with the white margin of the marker."""
 MIDDLE = 0.38
 """Metres over the floor."""
 
@@ -27,12 +27,12 @@ _BLACK, _WHITE = 20, 235
 Image = npt.NDArray[np.uint8]
 
 
-class ViewColumn(NamedTuple):
-    """How the camera looks.
+class CameraView(NamedTuple):
+    """Geometry of the camera.
 
-    :ivar focal: pixels
-    :ivar horizon: row of the picture
-    :ivar height: metres over the floor
+    :ivar focal: focal length, pixels
+    :ivar horizon: row of the image
+    :ivar height: above the floor, metres
     """
 
     focal: float
@@ -41,15 +41,15 @@ class ViewColumn(NamedTuple):
 
 
 class ChargerPlates:
-    """Draws the chargers of a world, where a column of the picture meets one."""
+    """Draws the chargers of a world into the columns of an image."""
 
-    def __init__(self, world: World, eye: ViewColumn) -> None:
+    def __init__(self, world: World, view: CameraView) -> None:
         self._world = world
-        self._eye = eye
+        self._view = view
         self._plates = [(each, _texture(each.marker)) for each in world.chargers]
 
     def draw(self, frame: Image, pose: Pose, hits: Hits, depth: Floats, clear: Floats) -> None:
-        """Draw what is seen of them over the walls.
+        """Draw the visible chargers over the walls.
 
         :param frame: BGR, shape (height, width, 3)
         :param hits: of each column's ray
@@ -57,32 +57,32 @@ class ChargerPlates:
         :param clear: share of each hit's colour that fog leaves, shape (width,)
         """
         for charger, texture in self._plates:
-            met = (hits.surface == charger.wall) & (np.abs(hits.along - charger.along) < SIDE / 2)
-            columns = np.flatnonzero(met)
-            if len(columns) and self._world.looks_at(charger, pose.x, pose.y):
+            hit = (hits.surface == charger.wall) & (np.abs(hits.along - charger.along) < SIDE / 2)
+            columns = np.flatnonzero(hit)
+            if len(columns) and self._world.faces(charger, pose.x, pose.y):
                 span = slice(int(columns[0]), int(columns[-1]) + 1)
                 self._draw(frame[:, span], charger, texture, _part(hits, span), depth[span], clear[span])
 
     def _draw(
         self, strip: Image, charger: Charger, texture: Image, hits: Hits, depth: Floats, clear: Floats
     ) -> None:
-        """One plate into the columns between its first and its last; what stands before it has others."""
-        focal, horizon, height = self._eye
+        """Draw one plate into the columns from its first to its last; columns of obstacles before it are left out."""
+        focal, horizon, height = self._view
         offset = hits.along - charger.along
-        met = (hits.surface == charger.wall) & (np.abs(offset) < SIDE / 2)
-        scale = focal / np.where(met, depth, 1.0)  # pixels for each metre
+        hit = (hits.surface == charger.wall) & (np.abs(offset) < SIDE / 2)
+        scale = focal / np.where(hit, depth, 1.0)  # pixels for each metre
         top = horizon - (MIDDLE + SIDE / 2 - height) * scale
         bottom = horizon - (MIDDLE - SIDE / 2 - height) * scale
         first, last = max(0, math.floor(top.min())), min(len(strip), math.ceil(bottom.max()))
         texels_per_row = (_TEXELS / (SIDE * scale)).astype(np.float32)
         rows = np.arange(first, last, dtype=np.float32)[:, None] + np.float32(0.5)
         down = (rows - top.astype(np.float32)) * texels_per_row - np.float32(0.5)
-        # As with walls: what is not the plate must stay as it is.
-        outside = (down < -0.5) | (down > _TEXELS - 0.5) | ~met
+        # As with walls, pixels that are not of the plate must stay.
+        outside = (down < -0.5) | (down > _TEXELS - 0.5) | ~hit
         np.clip(down, 0, _TEXELS - 1, out=down)
         down[outside] = -10.0
         columns = np.tile(np.arange(len(depth), dtype=np.float32), (last - first, 1))
-        # Seen from before it the wall runs from right to left.
+        # Seen from the front the wall runs from right to left.
         across = np.clip((0.5 - offset / SIDE) * _TEXELS, 0, _TEXELS - 1).astype(np.int64)
         cv2.remap(
             _lit(texture[:, across], hits.facing, clear),
@@ -95,7 +95,7 @@ class ChargerPlates:
 
 
 def _lit(grey: Image, facing: Floats, clear: Floats) -> Image:
-    """Columns of a texture as walls are lit, shape (texels, columns, 3)."""
+    """Columns of a texture, lit like walls, shape (texels, columns, 3)."""
     light = (0.45 + 0.55 * facing) * clear
     haze = np.array(textures.FOG) * (1 - clear)[:, None]
     painted: Image = np.minimum((grey * light)[:, :, None] + haze, 255.0).astype(np.uint8)
@@ -107,7 +107,7 @@ def _part(hits: Hits, span: slice) -> Hits:
 
 
 def _texture(number: int) -> Image:
-    """A plate as seen from before it, shape (texels, texels), grey."""
+    """A plate seen from the front, shape (texels, texels), grey."""
     side = round(_TEXELS * MARKER_SIDE / SIDE)
     marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(_FAMILY), number, side)
     edge = (_TEXELS - side) // 2

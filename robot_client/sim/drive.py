@@ -1,4 +1,5 @@
-"""Differential-drive physics: what the body makes of the velocity asked for. Pure; time is an argument."""
+"""Differential-drive physics: moves a body by commanded velocities, within its limits and walls. Pure; time is an
+argument."""
 
 from __future__ import annotations
 
@@ -12,10 +13,10 @@ RADIUS = 0.18
 """Metres from the robot's centre to its round hull."""
 
 LONGEST_STEP = 0.02
-"""Seconds; longer times are cut into steps, so that nothing moves further than the hull's radius at once."""
+"""Seconds of one step; longer times are cut, so that the body never moves further than its radius at once."""
 
 HIGHEST_SPEED = 2.0
-"""m/s, the most `max_speed` may be set to. 2 m/s × 0.02 s is less than the hull's radius: walls hold."""
+"""m/s, the greatest ``max_speed``: 2 m/s × 0.02 s is less than the hull's radius, so no step crosses a wall."""
 
 _SKIN = 1e-6
 _PUSHES = 4
@@ -24,9 +25,9 @@ _BLOCKED_SHARE = 0.3
 
 
 class MotorLimits(NamedTuple):
-    """What the motors can do.
+    """Limits of the motors, m/s, rad/s, m/s² and rad/s².
 
-    Stops are harder than starts, as with a short-circuit brake: 0.5 m/s is gone in two steps of 20 ms.
+    Braking is stronger than speeding up, as with a short-circuit brake: 0.5 m/s ends within two steps of 20 ms.
 
     :ivar speed: m/s, either way
     :ivar turn: rad/s, either way
@@ -50,61 +51,66 @@ class Twist(NamedTuple):
     turn: float
 
 
-STANDING = Twist(0.0, 0.0)
+ZERO_TWIST = Twist(0.0, 0.0)
 
 
 @dataclass
 class SimBody:
     """A round robot on two wheels in a world.
 
-    :ivar target: the velocity asked for, before limits
-    :ivar velocity: the velocity the body really has, walls considered
-    :ivar moving: the body turned or changed place in its last step, be it by sliding
-    :ivar touching: a wall turned it aside or held it back in its last step
-    :ivar blocked: the body is held back by a wall while it wants to drive on
-    :ivar travelled: metres driven since the beginning
+    :ivar target: the commanded velocity, before limits
+    :ivar velocity: the actual velocity, limited by motors and walls
+    :ivar moving: whether the body turned or changed its position in its last step, also by sliding along a wall
+    :ivar touching: whether a wall deflected or stopped it in its last step
+    :ivar blocked: whether a wall stops the body while it is commanded to drive
+    :ivar travelled: metres driven since the last reset
     """
 
     world: World
     pose: Pose
     limits: MotorLimits = DEFAULT_LIMITS
-    target: Twist = STANDING
-    velocity: Twist = STANDING
+    target: Twist = ZERO_TWIST
+    velocity: Twist = ZERO_TWIST
     moving: bool = False
     touching: bool = False
     blocked: bool = False
     travelled: float = 0.0
+    _stood_at: Pose | None = None
+    """The pose after a step in which it stood free. A further one would change nothing."""
 
     def reset(self, pose: Pose) -> None:
-        """Put the body somewhere, standing still, with nothing asked of it."""
-        self.pose, self.target, self.velocity = pose, STANDING, STANDING
+        """Place the body at a pose, at rest and without a commanded velocity."""
+        self.pose, self.target, self.velocity = pose, ZERO_TWIST, ZERO_TWIST
         self.moving, self.touching, self.blocked, self.travelled = False, False, False, 0.0
 
     def step(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the body by ``seconds``."""
         while seconds > 1e-9:
             self._step(min(seconds, LONGEST_STEP))
             seconds -= LONGEST_STEP
 
     def _step(self, dt: float) -> None:
-        wanted_velocity = self._wheels(dt)
-        wanted = along_arc(self.pose, wanted_velocity, dt)
-        reached = self._held_by_walls(wanted)
+        commanded = self._wheels(dt)
+        if commanded == self.velocity == ZERO_TWIST and self.pose is self._stood_at:
+            return
+        target_pose = along_arc(self.pose, commanded, dt)
+        reached = self._slide_along_walls(target_pose)
         moved_x, moved_y = reached.x - self.pose.x, reached.y - self.pose.y
         moved = math.hypot(moved_x, moved_y)
-        self.velocity, self.blocked = wanted_velocity, False
-        self.touching = reached is not wanted
-        if reached is not wanted and wanted_velocity.speed:
-            middle = self.pose.heading + wanted_velocity.turn * dt / 2
+        self.velocity, self.blocked = commanded, False
+        self.touching = reached is not target_pose
+        if reached is not target_pose and commanded.speed:
+            middle = self.pose.heading + commanded.turn * dt / 2
             achieved = (moved_x * math.cos(middle) + moved_y * math.sin(middle)) / dt
-            # A push out of a wall may never add speed, nor turn the way of travel round.
-            share = clamp(max(achieved / wanted_velocity.speed, 0.0), 1.0)
-            speed = wanted_velocity.speed * share if moved > _STILL else 0.0
-            self.velocity = Twist(speed, wanted_velocity.turn)
+            # A push out of a wall must neither add speed nor reverse the direction of travel.
+            share = clamp(max(achieved / commanded.speed, 0.0), 1.0)
+            speed = commanded.speed * share if moved > _STILL else 0.0
+            self.velocity = Twist(speed, commanded.turn)
             self.blocked = share < _BLOCKED_SHARE
-        self.moving = self.velocity != STANDING or moved > _STILL
+        self.moving = self.velocity != ZERO_TWIST or moved > _STILL
         self.travelled += moved
         self.pose = reached
+        self._stood_at = None if self.moving or self.touching else reached
 
     def _wheels(self, dt: float) -> Twist:
         limits, now = self.limits, self.velocity
@@ -114,20 +120,20 @@ class SimBody:
             approach(now.turn, turn, limits.turning_up * dt, limits.turn_braking * dt),
         )
 
-    def _held_by_walls(self, wanted: Pose) -> Pose:
-        """Slide along what is in the way; stay where no place is free. The same object if nothing is."""
-        x, y = wanted.x, wanted.y
+    def _slide_along_walls(self, target_pose: Pose) -> Pose:
+        """Slide along obstacles; stay where no position is free. Returns the same object where there is no obstacle."""
+        x, y = target_pose.x, target_pose.y
         for _ in range(_PUSHES):
             contact = self.world.nearest(x, y)
             if contact.distance >= RADIUS:
-                return wanted if (x, y) == wanted[:2] else Pose(x, y, wanted.heading)
+                return target_pose if (x, y) == target_pose[:2] else Pose(x, y, target_pose.heading)
             push = RADIUS + _SKIN - contact.distance
             x, y = x + push * contact.away_x, y + push * contact.away_y
-        return Pose(self.pose.x, self.pose.y, wanted.heading)
+        return Pose(self.pose.x, self.pose.y, target_pose.heading)
 
 
 def along_arc(pose: Pose, twist: Twist, dt: float) -> Pose:
-    """Where a body is after driving a circular arc at constant velocity for dt seconds (exact, not Euler)."""
+    """The pose after driving a circular arc at constant velocity for ``dt`` seconds (exact, not Euler)."""
     angle = twist.turn * dt
     heading = math.remainder(pose.heading + angle, math.tau)
     # chord of the arc: length v·dt·sin(a/2)/(a/2), in the direction halfway

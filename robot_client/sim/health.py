@@ -1,4 +1,4 @@
-"""What the robot says about its own health. Pure: facts in, findings out."""
+"""Diagnostics of the simulated robot, from its state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Severity(enum.IntEnum):
 
 
 class PartFinding(NamedTuple):
-    """One part of the robot, how it is, and the figures behind it."""
+    """State of one part of the robot, with measurements."""
 
     part: str
     severity: Severity
@@ -36,7 +36,7 @@ def motors(speed: float, turn: float, blocked: bool, travelled: float) -> PartFi
 
 
 def battery(charge: float, volts: float, amperes: float, charging: bool = False) -> PartFinding:
-    """:param charge: share of the capacity left, 0 to 1; :param charging: whether it hangs on a charger"""
+    """:param charge: remaining capacity, 0 to 1; :param charging: whether a charger is connected"""
     values = {"charge_percent": f"{charge * 100:.1f}", "volts": f"{volts:.2f}", "amperes": f"{amperes:.2f}"}
     if charging:
         return PartFinding("battery", Severity.OK, "charging" if charge < 1.0 else "full", values)
@@ -48,7 +48,7 @@ def battery(charge: float, volts: float, amperes: float, charging: bool = False)
 
 
 def camera(enabled: bool, viewers: int, frames: int, render_ms: float) -> PartFinding:
-    """:param viewers: subscriptions to its topics; :param frames: pictures sent so far"""
+    """:param viewers: subscriptions to its topics; :param frames: images sent so far"""
     values = {"viewers": str(viewers), "frames": str(frames), "render_ms": f"{render_ms:.2f}"}
     if not enabled:
         return PartFinding("camera", Severity.STALE, "switched off", values)

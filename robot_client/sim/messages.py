@@ -1,23 +1,26 @@
-"""The simulated robot's state as ROS 2 messages. Built new each time they are needed; no publishing here."""
+"""Builds ROS 2 messages from the simulated robot's state; publishes nothing."""
 
 from __future__ import annotations
 
 import array
 import math
+import sys
 
 import numpy as np
 import numpy.typing as npt
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Quaternion, TransformStamped
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
+from nav_msgs.msg import OccupancyGrid, Odometry
+from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, LaserScan
 from std_msgs.msg import Header
 
 from robot_client.sim import robot as scanner
-from robot_client.sim.battery import CAPACITY_AH, SimBattery
+from robot_client.sim.depth_camera import FOCAL
 from robot_client.sim.drive import Twist
+from robot_client.sim.floor_plan import FloorPlan
 from robot_client.sim.health import PartFinding
+from robot_client.sim.robot import CAPACITY_AH, SimBattery
 from robot_client.sim.world import Pose
 
 LASER_HEIGHT = 0.18
@@ -33,14 +36,16 @@ class Frames:
     def __init__(self, namespace: str) -> None:
         prefix = namespace.strip("/")
         prefix = f"{prefix}/" if prefix else ""
+        self.map = f"{prefix}map"
         self.odom = f"{prefix}odom"
         self.base = f"{prefix}base_link"
         self.laser = f"{prefix}laser"
         self.camera = f"{prefix}camera"
+        self.depth = f"{prefix}camera_depth_optical_frame"
 
 
 def odometry(stamp: Time, frames: Frames, pose: Pose, velocity: Twist) -> Odometry:
-    """Pose relative to where the world's origin is, velocity in the body's frame."""
+    """Pose relative to the world's origin, velocity in the body's frame."""
     message = Odometry(header=Header(stamp=stamp, frame_id=frames.odom))
     message.child_frame_id = frames.base
     message.pose.pose.position.x = pose.x
@@ -59,12 +64,17 @@ def transform(stamp: Time, frames: Frames, pose: Pose) -> TransformStamped:
 
 
 def static_transforms(stamp: Time, frames: Frames, camera_height: float) -> list[TransformStamped]:
-    """base_link → laser and camera; both sit in the middle of the robot.
+    """map → odom, which is exact; base_link → laser and cameras, which sit in the middle of the robot.
 
     :param camera_height: metres over the floor
     """
     middle = Pose(0.0, 0.0, 0.0)
+    depth = _transform(stamp, frames.base, frames.depth, middle, camera_height)
+    # REP 103: z ahead, x to the right, y down.
+    depth.transform.rotation = Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5)
     return [
+        depth,
+        _transform(stamp, frames.map, frames.odom, middle, 0.0),
         _transform(stamp, frames.base, frames.laser, middle, LASER_HEIGHT),
         _transform(stamp, frames.base, frames.camera, middle, camera_height),
     ]
@@ -94,6 +104,39 @@ def image(stamp: Time, frames: Frames, pixels: npt.NDArray[np.uint8]) -> Image:
     return message
 
 
+def depth_image(stamp: Time, frames: Frames, depth: npt.NDArray[np.uint16]) -> Image:
+    """:param depth: millimetres, shape (height, width)"""
+    message = Image(header=Header(stamp=stamp, frame_id=frames.depth))
+    message.height, message.width = depth.shape
+    message.step = message.width * 2
+    message.encoding = "16UC1"
+    message.is_bigendian = sys.byteorder == "big"
+    message.data.frombytes(depth.tobytes())
+    return message
+
+
+def depth_camera_info(stamp: Time, frames: Frames, width: int, height: int) -> CameraInfo:
+    """The model of the depth camera, without distortion."""
+    message = CameraInfo(header=Header(stamp=stamp, frame_id=frames.depth), width=width, height=height)
+    across, down = (width - 1) / 2, (height - 1) / 2
+    message.distortion_model, message.d = "plumb_bob", [0.0] * 5
+    message.k = np.array((FOCAL, 0, across, 0, FOCAL, down, 0, 0, 1), dtype=np.float64)
+    message.r = np.eye(3).ravel()
+    message.p = np.array((FOCAL, 0, across, 0, 0, FOCAL, down, 0, 0, 0, 1, 0), dtype=np.float64)
+    return message
+
+
+def occupancy_grid(stamp: Time, frames: Frames, plan: FloorPlan) -> OccupancyGrid:
+    """The map."""
+    message = OccupancyGrid(header=Header(stamp=stamp, frame_id=frames.map))
+    message.info.map_load_time = stamp
+    message.info.resolution = plan.resolution
+    message.info.height, message.info.width = plan.cells.shape
+    message.info.origin.position.x, message.info.origin.position.y = plan.x, plan.y
+    message.data = array.array("b", plan.cells.tobytes())
+    return message
+
+
 def compressed(stamp: Time, frames: Frames, jpeg: bytes) -> CompressedImage:
     """:param jpeg: a JPEG file"""
     message = CompressedImage(header=Header(stamp=stamp, frame_id=frames.camera))
@@ -103,7 +146,7 @@ def compressed(stamp: Time, frames: Frames, jpeg: bytes) -> CompressedImage:
 
 
 def battery(stamp: Time, frames: Frames, pack: SimBattery) -> BatteryState:
-    """What isn't measured is NaN, as the message's definition wants it."""
+    """The state of the battery; values that are not measured are NaN, as the message's definition requires."""
     message = BatteryState(header=Header(stamp=stamp, frame_id=frames.base))
     message.voltage = pack.voltage
     message.current = -pack.current
@@ -126,7 +169,7 @@ def _supply_status(pack: SimBattery) -> int:
 
 
 def diagnostics(stamp: Time, robot: str, findings: list[PartFinding]) -> DiagnosticArray:
-    """:param robot: the name that stands before each part"""
+    """:param robot: the name before that of each part"""
     message = DiagnosticArray(header=Header(stamp=stamp))
     message.status = [
         DiagnosticStatus(

@@ -1,4 +1,4 @@
-"""Things to be done at fixed rates, in one thread. Pure: the clock is asked, never waited for."""
+"""Tasks at fixed rates in one thread. It reads the clock, but never waits."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class Schedule:
         self._entries: list[_Entry] = []
 
     def every(self, period: float, task: Task, catch_up: int = 1) -> None:
-        """Do a task now and then regularly.
+        """Run a task now and then periodically.
 
         :param period: seconds
-        :param catch_up: times it is done at most when the process was held up; what is beyond is let go
+        :param catch_up: most runs after a delay; further missed runs are skipped
         """
         self._entries.append(_Entry(period, task, catch_up, self._clock()))
 
     def run_due(self) -> float:
-        """Do what is due and return the seconds until something is due again."""
+        """Run due tasks, and return the seconds until the next one."""
         for entry in self._entries:
             for _ in range(entry.catch_up):
                 if self._clock() < entry.due:

@@ -1,4 +1,4 @@
-"""What the camera's world is painted with: wall textures, floor tiles and the panorama behind the walls."""
+"""Textures of the simulated camera: walls, floor tiles and the panorama behind the walls."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ TEXELS = 64
 
 FOG = (214, 206, 196)
 """BGR that far things fade to."""
+
+FOG_LENGTH = 26.0
+"""Metres after which fog hides about two thirds of a colour."""
 
 FLOOR_TINT = (10, 6, 0)
 """BGR that is added to the floor's brightness."""

@@ -11,7 +11,7 @@ MS = 1_000_000
 
 @pytest.mark.parametrize("sent", [0, 123_456_789_012_345, 10**13 - MS])
 def test_the_age_of_a_command_is_read_from_the_record(sent: int) -> None:
-    """To a hundredth of a millisecond, also when the count has begun anew meanwhile."""
+    """To 0.01 ms, also after the counter has restarted."""
     record = [
         {"event": "command", "t": sent + 250 * MS, "v": 0.2, "w": stamped_turn(sent)},
         {"event": "command", "t": sent + 300 * MS, "v": 0.0, "w": 0.0},
@@ -22,7 +22,7 @@ def test_the_age_of_a_command_is_read_from_the_record(sent: int) -> None:
 
 @pytest.mark.parametrize(("sent", "before"), [(-MS, True), (0, False), (5 * MS, False)])
 def test_a_command_from_before_a_moment_is_known(sent: int, before: bool) -> None:
-    """Though it was carried out after it; zeros are no matter."""
+    """Though it was executed after it; zeros do not count."""
     moment = 123_456_789_012_000
     record = [
         {"event": "command", "t": moment + 300 * MS, "v": 0.0, "w": 0.0},
@@ -34,13 +34,13 @@ def test_a_command_from_before_a_moment_is_known(sent: int, before: bool) -> Non
 
 @pytest.mark.parametrize(("v", "w"), [(0.2, 0.0), (-0.2, 0.0), (0.0, 0.6)])
 def test_the_first_command_to_move_is_found(v: float, w: float) -> None:
-    """Behind zeros, ahead, back or round; where there are only zeros, there is none."""
+    """After zeros: forward, backward or turning; with only zeros there is none."""
     zeros = [{"event": "command", "t": 1, "v": 0.0, "w": 0.0}, {"event": "standstill", "t": 2}]
     moves = [{"event": "command", "t": at, "v": v, "w": w} for at in (3, 4)]
     assert first_move(zeros + moves) == 3
     assert first_move(zeros) == 0
 
 
-def test_what_is_written_into_a_command_moves_nothing_else() -> None:
-    """The turning speed is the same to a part in ten thousand."""
+def test_text_in_a_command_moves_nothing_else() -> None:
+    """The turning speed is the same to 1 in 10,000."""
     assert stamped_turn(10**13 - 1) == pytest.approx(0.6, abs=1.1e-4)

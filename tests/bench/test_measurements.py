@@ -1,4 +1,4 @@
-"""Every measurement runs, with tiny counts, and yields figures. What the figures are is not asked here."""
+"""Every measurement runs, with tiny counts, and yields figures, whose values are not checked here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.__main__ import MEASUREMENTS
+from bench.__main__ import MEASUREMENTS, exit_code, measure
 from bench.report import Options, Row, Unavailable, ratio_text, save
 
 LEAST_ROWS = {
@@ -20,17 +20,25 @@ LEAST_ROWS = {
     "viewers": 2,
     "idle": 1,
     "endtoend": 1,
+    "foxglove": 2,
+    "reconnects": 4,
     "crowd": 10,
     "soak": 7,
     "video": 16,
     "browser": 6,
-    "thin": 8,
+    "thin": 6,
     "standstill": 3,
     "control": 6,
     "stopping": 4,
     "alerts": 5,
-    "apps": 15,
+    "apps": 14,
     "memory": 10,
+    "modules": 10,
+    "pipes": 5,
+    "navigation": 10,
+    "offload": 10,
+    "cluster": 8,
+    "roles": 7,
     "hostile": 3,
     "unproven": 7,
 }
@@ -38,11 +46,13 @@ LEAST_ROWS = {
 
 @pytest.mark.parametrize("name", MEASUREMENTS)
 def test_a_measurement_yields_its_rows(name: str) -> None:
-    """Each row has a finite figure and a name of its own; without what only ``make bench`` installs it says so."""
+    """Each row has a finite figure and a unique name; without packages that only ``make bench`` installs it
+    reports so.
+    """
     try:
         rows = importlib.import_module(f"bench.{name}").run(Options(quick=True))
     except Unavailable as reason:
-        # The extra 'bench' and HAProxy are no part of what tests install; the reason must be words.
+        # Tests install neither the extra 'bench' nor HAProxy; the reason must be given in words.
         assert str(reason)
         return
     assert len(rows) >= LEAST_ROWS[name]
@@ -53,8 +63,18 @@ def test_a_measurement_yields_its_rows(name: str) -> None:
         assert row.measurement == name
 
 
+def test_without_foxglove_sdk_a_sentence_names_the_command_that_installs_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    rows, why = measure("foxglove", Options(quick=True))
+    assert rows == []
+    assert why.startswith("foxglove-sdk is not installed")
+    assert "(scripts/setup.sh python)" in why
+
+
 def test_a_bar_for_the_ratio_is_met_or_missed() -> None:
-    """Ours over the alternative's is compared with the bar, and without an alternative nothing is met."""
+    """Ours over the alternative's is compared with the bar; without an alternative it counts as missed."""
     assert Row("x", "x", "µs", 1.0, 4.0, "y", ratio_bar=0.25).met is True
     assert Row("x", "x", "µs", 1.1, 4.0, "y", ratio_bar=0.25).met is False
     assert Row("x", "x", "µs", 1.0, None, ratio_bar=0.25).met is False
@@ -67,15 +87,15 @@ def test_a_bar_for_the_figure_is_met_or_missed() -> None:
     assert Row("x", "x", "messages", 1, bar=0).met is False
 
 
-def test_ratios_read_as_people_say_them() -> None:
+def test_ratios_are_readable() -> None:
     """Parts below one, times above."""
     assert ratio_text(0.25) == "1/4"
     assert ratio_text(2.5) == "2.5×"
     assert ratio_text(None) == ""
 
 
-def test_what_is_kept_names_no_machine(tmp_path: Path) -> None:
-    """Figures, bars and facts of the machine are kept; its name, users and paths are not."""
+def test_stored_file_names_no_machine(tmp_path: Path) -> None:
+    """Figures, bars and facts of the machine are stored; its name, users and paths are not."""
     path = tmp_path / "figures.json"
     save(path, "hop", [Row("hop", "x", "µs", 1.0, 4.0, "y", 0.25)], "", 0.5, "abc")
     save(path, "latency", [], "no HAProxy", 0.5, "abc")
@@ -84,3 +104,25 @@ def test_what_is_kept_names_no_machine(tmp_path: Path) -> None:
     assert content["measurements"]["hop"]["rows"][0]["met"] is True
     assert content["measurements"]["latency"]["missing"] == "no HAProxy"
     assert str(Path.home()) not in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("ours", "missing", "code", "strict_code"),
+    [
+        (1.0, {}, 0, 0),
+        (2.0, {}, 0, 1),
+        (1.0, {"latency": "HAProxy is not installed"}, 0, 1),
+        (1.0, {"latency": "failed: OSError()"}, 1, 1),
+    ],
+)
+def test_a_missed_bar_is_in_the_exit_code_only_if_strict(
+    ours: float, missing: dict[str, str], code: int, strict_code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [Row("hop", "cost", "µs", ours, bar=1.5), Row("hop", "without a bar", "µs", 9.0)]
+    assert exit_code(rows, missing, strict=False) == code
+    assert capsys.readouterr().out == ""
+    assert exit_code(rows, missing, strict=True) == strict_code
+    printed = capsys.readouterr().out
+    assert ("hop: cost missed its bar" in printed) == (ours > 1.5)
+    assert ("latency was not measured" in printed) == bool(missing)
+    assert "without a bar" not in printed

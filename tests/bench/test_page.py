@@ -1,4 +1,4 @@
-"""The page of figures is written from what was kept, and nothing else."""
+"""The page of figures is written from stored figures only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROWS = [
 
 
 def kept(tmp_path: Path) -> dict[str, object]:
-    """What a run with these rows leaves."""
+    """The file of a run with these rows."""
     path = tmp_path / "figures.json"
     for row in ROWS:
         save(path, row.measurement, [row], "", 0.5, "abc")
@@ -25,13 +25,13 @@ def kept(tmp_path: Path) -> dict[str, object]:
     return dict(json.loads(path.read_text()))
 
 
-def test_figures_survive_being_kept(tmp_path: Path) -> None:
-    """Rows read back are the rows that were measured."""
+def test_figures_survive_storage(tmp_path: Path) -> None:
+    """Rows read back equal the measured ones."""
     assert rows_of(kept(tmp_path)) == ROWS
 
 
-def test_missed_bars_and_missing_measurements_are_told(tmp_path: Path) -> None:
-    """A missed bar is a plain no, the sum is stated, and what was not measured is named with its reason."""
+def test_missed_targets_and_missing_measurements_are_reported(tmp_path: Path) -> None:
+    """A missed bar is marked "no", the sum is stated, and missing measurements have a reason."""
     text = figures(kept(tmp_path))
     assert "| `fanout` | fan-out | ≤ 2× | 9 µs | 4 µs, a loop | 2.25× | **no** |" in text
     assert "2 of 3 bars are met" in text
@@ -40,7 +40,7 @@ def test_missed_bars_and_missing_measurements_are_told(tmp_path: Path) -> None:
 
 
 def test_missed_bars_are_explained_and_met_ones_are_not() -> None:
-    """A reason stands for as long as its row is missed; what has no bar is explained while it costs more."""
+    """A reason is shown as long as its row is missed; rows without a bar are explained while they cost more."""
     for (measurement, what), why in WHY.items():
         missed = Row(measurement, what, "µs", 3.0, 2.0, "a proxy", 1.0)
         assert (
@@ -53,13 +53,13 @@ def test_missed_bars_are_explained_and_met_ones_are_not() -> None:
 
 
 def test_reasons_are_of_rows_that_are_measured() -> None:
-    """No reason is left over from a row that is called otherwise now."""
+    """Reasons of renamed rows are found."""
     rows = rows_of(json.loads((RESULTS / "latest.json").read_text()))
     for measurement, what in WHY:
         assert any(row.measurement == measurement and row.what.startswith(what) for row in rows)
 
 
 def test_the_page_has_its_place_for_figures() -> None:
-    """The marks are there, in order."""
+    """The marks exist, in order."""
     text = PAGE.read_text()
     assert 0 < text.index(BEGIN) < text.index(END)

@@ -1,4 +1,4 @@
-"""The stand-in for rosbridge's conversion gives what ours gives: both tell the same message."""
+"""The substitute for rosbridge's conversion gives the relay's results: both decode the same message."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def alike(ours: Any, theirs: Any) -> bool:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_both_ways_give_the_same_values(case: Case) -> None:
+def test_both_conversions_give_the_same_values(case: Case) -> None:
     """The walk, its lean form, and the relay's codec agree on every field of all five messages."""
     from rclpy.serialization import serialize_message
 

@@ -1,13 +1,12 @@
-"""The program's own parts read scans through what keeps their time."""
+"""The program's own parts read scans through a recorder of their time."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from switchboard_socket import Socket
-
 from bench.scanning import SCAN, Kept, program
 from robot_client.apps.collision_avoidance import ScanReading
+from tests.worlds.memory_socket import Socket
 
 
 def scan(sec: int, nanosec: int, distance: float) -> dict[str, Any]:
@@ -18,7 +17,7 @@ def scan(sec: int, nanosec: int, distance: float) -> dict[str, Any]:
 
 
 def test_the_stamp_is_of_the_scan_that_was_read_last() -> None:
-    """To the nanosecond, also while another waits; what the program says goes on to the relay."""
+    """In nanoseconds, also while another waits; the program's messages are passed on to the relay."""
     socket = Socket()
     kept = Kept(socket)
     link, _ = program(kept)
@@ -31,7 +30,7 @@ def test_the_stamp_is_of_the_scan_that_was_read_last() -> None:
 
 
 def test_a_stamp_is_kept_while_nothing_comes() -> None:
-    """A scan that does not come within the time is none, and takes nothing away."""
+    """A missing scan is None, and changes nothing."""
     socket = Socket()
     kept = Kept(socket)
     link, _ = program(kept)

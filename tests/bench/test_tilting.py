@@ -1,4 +1,4 @@
-"""Without a browser or a portal there is no tilt, and why is said in words."""
+"""Without a browser or a portal the measurement gives a reason."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from bench.tilting import tilts
 
 
 def measure() -> None:
-    """Nothing is asked of relay and robot before there is what it takes."""
+    """Neither relay nor robot is used before the prerequisites are there."""
     tilts(Mock(spec_set=[]), Mock(spec_set=[]), "driver", "correct horse", 1)
 
 
-def test_without_chromium_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And how to get it."""
+def test_without_chromium_the_reason_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the way to install it."""
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(Unavailable, match=r"no Chromium .*apt install"):
         measure()
 
 
-def test_without_the_portal_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """And how to build it."""
+def test_without_the_portal_the_reason_is_given(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """With the way to build it."""
     monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(relay_server, "PORTAL", tmp_path)
     with pytest.raises(Unavailable, match=r"not built .*make web"):

@@ -1,4 +1,4 @@
-"""What cases are made of: which operation and which sentence of which document they check, and what became of them."""
+"""Cases: the operation and the sentence of the document that each checks, and their results."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ WORDS = {
 NO_STATUS = "it sends no status, errors go to its node's log only (rosbridge_library/protocol.py, log)"
 """Why every case that reads a ``status`` differs on rosbridge_suite."""
 
-SPEC_ONLY = "a rule of this project's SPEC.md, not of rosbridge v2"
-"""What a case that cites SPEC.md alone, or first, says about a server that never promised it: nothing."""
+SPEC_ONLY = "a rule of this project's SPEC, not of rosbridge v2"
+"""What a case that cites the SPEC alone, or first, says about a server that never promised it: nothing."""
 
 FIXTURE_VERSION = 2
 FIXTURE_PATIENCE = 10.0
@@ -43,17 +43,18 @@ _names = itertools.count(1)
 
 
 def case(op: str, section: str, *, suite: str = "") -> pytest.MarkDecorator:
-    """Make a test function a case.
+    """Makes a test function a case.
 
     :param op: operation it belongs to in the table
     :param section: document and section it checks
-    :param suite: how rosbridge_suite 2.1 is known to differ, with where that is seen; needless for a section of SPEC
+    :param suite: the known difference of rosbridge_suite 2.1, with its source; not needed for a section of
+        SPEC
     """
     return getattr(pytest.mark, MARK)(op=op, section=section, suite=suite)
 
 
 def known_difference(mark: pytest.Mark, target: str) -> str:
-    """Why a case may fail on this target; empty when it may not."""
+    """Why a case may fail on this target; empty if it may not."""
     if target != ROSBRIDGE_SUITE:
         return ""
     known: str = mark.kwargs["suite"]
@@ -61,17 +62,17 @@ def known_difference(mark: pytest.Mark, target: str) -> str:
 
 
 def not_tried(why: str) -> None:
-    """End a case that can't be tried on this server."""
+    """Ends a case that cannot be tried on this server."""
     pytest.skip(f"not tried: {why}")
 
 
 def not_offered(why: str) -> None:
-    """End a case about something this robot doesn't offer."""
+    """Ends a case about a feature that this robot lacks."""
     pytest.skip(f"not offered: {why}")
 
 
 class Outcome(NamedTuple):
-    """What became of one case."""
+    """The result of one case."""
 
     op: str
     title: str
@@ -81,7 +82,7 @@ class Outcome(NamedTuple):
 
 
 def outcome_of(item: pytest.Item, report: pytest.TestReport) -> Outcome | None:
-    """The outcome a report tells, if it tells one."""
+    """The result in a report, if it has one."""
     mark = item.get_closest_marker(MARK)
     if (
         mark is None
@@ -106,15 +107,15 @@ def outcome_of(item: pytest.Item, report: pytest.TestReport) -> Outcome | None:
 
 
 def table(outcomes: Iterable[Outcome]) -> None:
-    """Print every case by operation, and the sum."""
-    told = list(outcomes)
-    places = {op: place for place, op in enumerate(dict.fromkeys(each.op for each in told))}
-    told.sort(key=lambda each: places[each.op])
+    """Prints every case by operation, and the sum."""
+    reported = list(outcomes)
+    places = {op: place for place, op in enumerate(dict.fromkeys(each.op for each in reported))}
+    reported.sort(key=lambda each: places[each.op])
     view = Table(box=None, pad_edge=False, header_style="bold")
     for name, ratio in (("op", None), ("case", 5), ("section", 3), ("outcome", None), ("remark", 4)):
         view.add_column(name, ratio=ratio, overflow="fold", no_wrap=ratio is None)
     before = ""
-    for each in told:
+    for each in reported:
         if before and each.op != before:
             view.add_section()
         view.add_row(
@@ -128,18 +129,18 @@ def table(outcomes: Iterable[Outcome]) -> None:
     console = Console(width=None if Console().is_terminal else 200, highlight=False)
     console.print()
     console.print(view)
-    sums = Counter(each.word for each in told)
+    sums = Counter(each.word for each in reported)
     console.print("\n" + ", ".join(f"{sums[word]} {word}" for word in WORDS if sums[word]))
 
 
 @dataclass
 class Server:
-    """The rosbridge server that is checked.
+    """The rosbridge server under test.
 
     :param url: its websocket
-    :param token: an access token, empty where none is needed
-    :param target: ``rosbridge_suite`` where its known differences are to be counted as such
-    :param patience: seconds an answer may take
+    :param token: an access token, empty if none is needed
+    :param target: ``rosbridge_suite`` to count its known differences as such
+    :param patience: timeout of an answer in seconds
     """
 
     url: str
@@ -147,6 +148,8 @@ class Server:
     target: str = ""
     patience: float = PATIENCE
     about: dict[str, Any] = field(default_factory=dict)
+    has_rosapi: bool = False
+    """Whether rosapi answered at the start. Of rosbridge_suite it is a process of its own."""
 
     def connect(self, **options: Any) -> Client:
         """A client that is logged in."""
@@ -159,11 +162,11 @@ class Server:
 
     @property
     def fixture_patience(self) -> float:
-        """Seconds the fixture node waits for what a command is about: less than the answer may take."""
+        """Timeout of the fixture node's commands in seconds: less than that of an answer."""
         return min(FIXTURE_PATIENCE, self.patience * 2 / 3)
 
     def look_for_fixture(self) -> str:
-        """Find the fixture node behind the server, and have it wait no longer than the suite; else, what is missing."""
+        """Finds the fixture node behind the server, and sets its timeout; otherwise returns what is missing."""
         with self.connect() as client:
             client.send("subscribe", topic="/conformance/about", type="std_msgs/msg/String")
             try:
@@ -178,30 +181,44 @@ class Server:
                 return "the fixture node is of another version: start it again from this checkout"
             words = ["patience", str(self.fixture_patience)]
             client.values("/conformance/do", {"prefixes": words, "depth": 0})
+            self.has_rosapi = self._answers(client, "/rosapi/get_time")
         return ""
 
-    def lives(self) -> bool:
-        """Whether a new client is served."""
+    def silent_part(self) -> str:
+        """What does not serve a new client: the server, or rosapi if it did at the start; empty: both do."""
         try:
             with self.connect() as client:
                 client.lives()
+                return "rosapi" if self.has_rosapi and not self._answers(client, "/rosapi/get_time") else ""
         except (AssertionError, OSError, WebSocketException):
+            return "the server"
+
+    @staticmethod
+    def _answers(client: Client, service: str) -> bool:
+        try:
+            client.values(service)
+        except AssertionError:
             return False
         return True
 
+    def needs_rosapi(self) -> None:
+        """Ends the case if rosapi did not answer at the start."""
+        if not self.has_rosapi:
+            not_tried("rosapi did not answer at the start")
+
     def needs_examples(self) -> None:
-        """End the case where the robot has no ``example_interfaces``."""
+        """Ends the case if the robot has no ``example_interfaces``."""
         if not self.about.get("example_interfaces"):
             not_tried("example_interfaces missing on the robot")
 
     def needs_token(self) -> None:
-        """End the case where the server is open to everybody."""
+        """Ends the case if the server needs no token."""
         if not self.token:
             not_tried("no TOKEN was given")
 
 
 class Hand:
-    """The fixture node on the robot, told what to do over a connection of its own."""
+    """The fixture node on the robot, controlled over a separate connection."""
 
     def __init__(self, server: Server) -> None:
         self._client = server.connect()
@@ -211,7 +228,7 @@ class Hand:
         self._open: list[tuple[str, str]] = []
 
     def close(self) -> None:
-        """Take away what was made, and leave."""
+        """Removes its endpoints, and disconnects."""
         try:
             for kind, topic in self._open:
                 self.do("end", kind, topic)
@@ -219,7 +236,7 @@ class Hand:
             self._client.close()
 
     def ask(self, command: str, *words: str) -> str:
-        """Send a command; the id its answer will have."""
+        """Sends a command; returns the id of its answer."""
         call_id = f"hand-{next(_names)}"
         args = {"prefixes": [command, *words], "depth": 0}
         self._client.send(
@@ -228,53 +245,53 @@ class Hand:
         return call_id
 
     def answer(self, call_id: str, seconds: float | None = None) -> list[str]:
-        """What a command gave.
+        """The result of a command.
 
-        :param seconds: of a command that waits for more than one thing
+        :param seconds: of a command that waits for more than one event
         """
-        told = self._client.until("service_response", seconds or self._limit, id=call_id)
-        assert told["result"] is True, f"/conformance/do failed: {told.get('values')}"
-        names: list[str] = told["values"]["result"]["names"]
+        reported = self._client.until("service_response", seconds or self._limit, id=call_id)
+        assert reported["result"] is True, f"/conformance/do failed: {reported.get('values')}"
+        names: list[str] = reported["values"]["result"]["names"]
         assert names[:1] != ["error"], names
         return names
 
     def do(self, command: str, *words: str) -> list[str]:
-        """Have something done; see ``fixture_node.py`` for the commands."""
+        """Runs a command; see ``fixture_node.py`` for the commands."""
         return self.answer(self.ask(command, *words))
 
     def topic(self, name: str, type_name: str, profile: str = "reliable") -> None:
-        """Let a topic appear."""
+        """Makes a topic."""
         self.do("publisher", name, type_name, profile)
         self._open.append(("publisher", name))
 
     def publish(self, name: str, *messages: Any) -> None:
-        """Publish on it as soon as somebody listens."""
+        """Publishes on it as soon as it has a subscriber."""
         count = self.do("publish", name, *(json.dumps(each) for each in messages))
         assert count != ["0"], f"the server did not subscribe to {name}"
 
     def vanish(self, name: str) -> None:
-        """Take a topic away."""
+        """Removes a topic."""
         self._open.remove(("publisher", name))
         self.do("end", "publisher", name)
 
     def listen(self, name: str, type_name: str, profile: str = "reliable") -> None:
-        """Record a topic."""
+        """Records a topic."""
         self.do("listen", name, type_name, profile)
         self._open.append(("subscription", name))
 
     def heard(self, name: str, count: int) -> list[Any]:
-        """Wait until so many messages came, and return all."""
+        """Waits for this many messages; returns all."""
         found = [json.loads(each) for each in self.do("heard", name, str(count), str(self.waits))]
         assert len(found) >= count, f"the robot heard {len(found)} messages on {name}, not {count}"
         return found
 
     def publishers(self, name: str, count: int) -> list[dict[str, Any]]:
-        """Wait until a topic has so many publishers in the robot's graph, and return what is known of them."""
+        """Waits until a topic has this many publishers in the robot's graph; returns their properties."""
         found = [json.loads(each) for each in self.do("publishers", name, str(count))]
         assert len(found) == count, f"{name} has {len(found)} publishers in the robot's graph, not {count}"
         return found
 
 
 def fresh_name(word: str = "topic") -> str:
-    """A name nobody has used, also not in an earlier run."""
+    """An unused name, also across runs."""
     return f"/conformance/{word}_{secrets.token_hex(3)}_{next(_names)}"

@@ -1,4 +1,4 @@
-"""Options, fixtures and the table of the conformance suite; see docs/conformance.md."""
+"""Options, fixtures and the table of the conformance suite; see docs/reference/conformance.md."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import subprocess
 import time
 from collections.abc import Generator, Iterator
+from pathlib import Path
 from typing import Any
 
 import conformance_suite as suite
@@ -25,41 +26,52 @@ RESTART_SECONDS = 60.0
 
 
 class Watch:
-    """Looks after each failure whether the server under test still serves, and has it started again if it does not.
+    """Checks after each failure whether the server under test still serves, and restarts it otherwise.
 
-    :param restart: shell command that starts it again, and returns; empty: the cases that are left are not tried
+    :param restart: shell command that restarts it, and returns; if empty, the remaining cases are not tried. With it
+        each file of cases has a fresh server
     """
 
     def __init__(self, server: suite.Server, restart: str) -> None:
         self._server = server
         self._restart = restart
         self._suspect = ""
+        self._file: Path | None = None
         self.dead = ""
-        """The case after which the server did not serve any more."""
+        """What does not serve any more, and since which case."""
+
+    def begin(self, file: Path) -> None:
+        """A case of a file is next."""
+        before, self._file = self._file, file
+        if self._restart and before not in (None, file):
+            self._start_again(f"the start for {file.name}")
 
     def suspect(self, case: str) -> None:
         """A case has failed."""
         self._suspect = case
 
     def look(self) -> None:
-        """Look whether it serves, if a case has failed since."""
+        """Checks the server, if a case has failed since."""
         case, self._suspect = self._suspect, ""
-        if not case or self._server.lives():
+        if not case or not (silent := self._server.silent_part()):
             return
-        if not self._restart:
-            self.dead = case
-            return
+        if self._restart:
+            self._start_again(case)
+        else:
+            self.dead = f"{silent} has not answered any more since {case}"
+
+    def _start_again(self, since: str) -> None:
         subprocess.run(self._restart, shell=True, check=False, timeout=RESTART_SECONDS)
         until = time.monotonic() + RESTART_SECONDS
-        while not self._server.lives():
+        while silent := self._server.silent_part():
             if time.monotonic() > until:
-                self.dead = case
+                self.dead = f"{silent} has not answered any more since {since}"
                 return
             time.sleep(0.5)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Where and what is checked."""
+    """Options for the server, the target and the robot."""
     group = parser.getgroup("conformance")
     group.addoption("--url", default="", help="websocket of the rosbridge server to check; without: our own")
     token = os.environ.get("CONFORMANCE_TOKEN", "")
@@ -81,7 +93,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, None]:
-    """Count known differences as such, and note what became of each case."""
+    """Counts known differences as such, and stores the result of each case."""
     report = (yield).get_result()
     mark = item.get_closest_marker(suite.MARK)
     if mark is not None and report.failed:
@@ -90,7 +102,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
             watch.suspect(item.name)
         known = suite.known_difference(mark, item.config.getoption("--target", ""))
         if report.when == "teardown" and item.stash.get(_failed, False):
-            report.outcome = "passed"  # what could not be cleared away after a failure is no second one
+            report.outcome = "passed"  # a failed cleanup after a failure is not another one
         elif known:
             report.outcome = "skipped"
             report.wasxfail = known
@@ -102,16 +114,17 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Go on only with a server that serves."""
+    """Continues only with a server that serves."""
     watch = item.config.stash.get(_watch, None)
     if watch is not None:
         watch.look()
+        watch.begin(item.path)
         if watch.dead:
-            suite.not_tried(f"the server has not answered any more since {watch.dead}")
+            suite.not_tried(watch.dead)
 
 
 def pytest_terminal_summary(config: pytest.Config) -> None:
-    """The table."""
+    """Prints the table."""
     asked = any(config.getoption(name, "") for name in ("--url", "--table", "--listen"))
     if asked and config.stash[_outcomes]:
         suite.table(config.stash[_outcomes])
@@ -148,15 +161,18 @@ def server(
 
 
 @pytest.fixture
-def client(server: suite.Server) -> Iterator[Client]:
-    """A client of its own for each case."""
+def client(server: suite.Server, request: pytest.FixtureRequest) -> Iterator[Client]:
+    """A new client for each case."""
+    mark = request.node.get_closest_marker(suite.MARK)
+    if mark is not None and mark.kwargs["op"].startswith("rosapi"):
+        server.needs_rosapi()
     with server.connect() as connected:
         yield connected
 
 
 @pytest.fixture
-def told(server: suite.Server) -> Iterator[Client]:
-    """A client that wants to hear of every error."""
+def reported(server: suite.Server) -> Iterator[Client]:
+    """A client that receives all errors."""
     with server.connect() as connected:
         connected.send("set_level", level="error")
         yield connected
@@ -164,7 +180,7 @@ def told(server: suite.Server) -> Iterator[Client]:
 
 @pytest.fixture
 def hand(server: suite.Server) -> Iterator[suite.Hand]:
-    """What the robot's side does for a case."""
+    """The robot's side of a case."""
     made = suite.Hand(server)
     try:
         yield made
@@ -174,5 +190,5 @@ def hand(server: suite.Server) -> Iterator[suite.Hand]:
 
 @pytest.fixture
 def topic() -> str:
-    """A topic nobody has used."""
+    """An unused topic."""
     return suite.fresh_name()

@@ -1,11 +1,12 @@
-"""The robot's side of the conformance suite: a ROS 2 node with something to see, to call and to ask for.
+"""The robot's side of the conformance suite: a ROS 2 node with topics, services and an action.
 
-Start it on the robot whose rosbridge server is to be checked, with ROS 2 sourced: ``python fixture_node.py``. It uses
-packages every ROS 2 has; with ``example_interfaces`` it also offers an action.
+Start it on the robot whose rosbridge server is to be checked, with ROS 2 sourced: ``python fixture_node.py``.
+It uses packages that every ROS 2 has; with ``example_interfaces`` it also offers an action.
 
-Everything is under ``/conformance``. The suite does the rest by the service ``/conformance/do`` (its type, strings in
-and strings out, is borrowed from ``rcl_interfaces/srv/ListParameters``): ``prefixes`` is a command with its words, say
-``["listen", "/chatter", "std_msgs/msg/String", "reliable"]``, and ``result.names`` the answer, or ``["error", why]``.
+Everything is under ``/conformance``. The suite does the rest by the service ``/conformance/do`` (its type,
+strings in and strings out, is borrowed from ``rcl_interfaces/srv/ListParameters``): ``prefixes`` is a command
+with its words, for example ``["listen", "/chatter", "std_msgs/msg/String", "reliable"]``, and
+``result.names`` the answer, or ``["error", why]``.
 """
 
 from __future__ import annotations
@@ -58,10 +59,10 @@ PROFILES = {
 
 
 class Pursuer(ActionClient):
-    """An action client that may be asked in any thread.
+    """An action client that may be used in any thread.
 
-    In rclpy (7.1) an answer that another thread of the executor takes up before the question has been noted is thrown
-    away ("Ignoring unexpected goal response"), and nothing ever comes of the goal.
+    In rclpy (7.1) an answer that another executor thread takes before the request has been stored is dropped
+    ("Ignoring unexpected goal response"), and the goal never continues.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -82,7 +83,7 @@ class Pursuer(ActionClient):
 
     async def execute(self, taken: Any) -> None:
         with self._asking:
-            pass  # now every question that can have been answered is noted
+            pass  # now every request that can have an answer is stored
         await super().execute(taken)
 
 
@@ -104,7 +105,7 @@ def to_plain(value: Any) -> Any:
 
 
 def fill(message: Any, values: dict[str, Any]) -> Any:
-    """Set fields of a message from a dict."""
+    """Sets fields of a message from a dict."""
     for name, value in values.items():
         if isinstance(value, dict):
             fill(getattr(message, name), value)
@@ -114,7 +115,7 @@ def fill(message: Any, values: dict[str, Any]) -> Any:
 
 
 def wait_for(condition: Callable[[], Any], seconds: float) -> Any:
-    """Poll until something true comes, and return it; after the time, whatever there is."""
+    """Polls until a value is true, and returns it; after the timeout, the last value."""
     until = time.monotonic() + seconds
     while not (found := condition()) and time.monotonic() < until:
         time.sleep(0.01)
@@ -122,7 +123,7 @@ def wait_for(condition: Callable[[], Any], seconds: float) -> Any:
 
 
 class Fixture(Node):
-    """See the module's text."""
+    """See the module's docstring."""
 
     def __init__(self) -> None:
         super().__init__("fixture", namespace="/conformance")
@@ -151,7 +152,8 @@ class Fixture(Node):
         self.create_timer(COUNTER_SECONDS, self._count, callback_group=self._group)
         self._echo = self.create_publisher(String, "/conformance/echo/out", PROFILES["reliable"])
         self.create_subscription(String, "/conformance/echo/in", self._echo.publish, PROFILES["reliable"])
-        # What moves and says so: the convention of docs/robots.md for checking a robot's motion.
+        # A topic that moves the robot and its report: the convention of docs/guides/robots.md for checking a
+        # robot's motion.
         heard = self.create_publisher(Twist, "/conformance/cmd_vel/heard", PROFILES["latched"])
         self.create_subscription(Twist, "/conformance/cmd_vel", heard.publish, PROFILES["reliable"])
         for type_, name, function in (
@@ -176,7 +178,7 @@ class Fixture(Node):
             callback_group=self._group,
         )
 
-    # --- what is always there ---
+    # --- permanent endpoints ---
 
     def _count(self) -> None:
         self._counter.publish(Int64(data=int((time.monotonic() - self._began) * 1000)))
@@ -202,7 +204,7 @@ class Fixture(Node):
         return response
 
     def _fibonacci(self, goal: Any) -> Any:
-        """A step every 50 ms; below 0 it is aborted, over 1000 it was not accepted."""
+        """A step every 50 ms; below 0 it is aborted, above 1000 it was not accepted."""
         sequence = [0, 1]
         result = Fibonacci.Result()
         for step in range(1, goal.request.order):
@@ -221,7 +223,7 @@ class Fixture(Node):
         result.sequence = sequence
         return result
 
-    # --- what is asked for ---
+    # --- commands ---
 
     def _do(self, request: Any, response: Any) -> Any:
         command, *words = request.prefixes
@@ -232,7 +234,7 @@ class Fixture(Node):
         return response
 
     def do_patience(self, seconds: str) -> list[str]:
-        """Wait so long for what a command is about."""
+        """Sets the timeout of commands."""
         self.patience = float(seconds)
         return []
 
@@ -240,14 +242,15 @@ class Fixture(Node):
         return wait_for(condition, self.patience)
 
     def do_publisher(self, topic: str, type_name: str, profile: str) -> list[str]:
-        """Let a topic appear."""
+        """Makes a topic."""
         self._ends["publisher", topic] = self.create_publisher(load(type_name), topic, PROFILES[profile])
         return []
 
     def do_publish(self, topic: str, *texts: str) -> list[str]:
-        """Publish messages, given as JSON, as soon as somebody listens.
+        """Publishes messages, given as JSON, as soon as there is a subscriber.
 
-        Who came before the topic was known there may listen best effort at first, and miss what comes meanwhile.
+        A server that subscribed before it knew the topic may use best effort at first, and miss messages
+        meanwhile.
         """
         publisher = self._ends["publisher", topic]
         if self._wait(publisher.get_subscription_count) and self._reliable(publisher):
@@ -261,19 +264,19 @@ class Fixture(Node):
         return bool(end.qos_profile.reliability == ReliabilityPolicy.RELIABLE)
 
     def do_latch(self, topic: str, text: str) -> list[str]:
-        """Publish at once, for those who come later."""
+        """Publishes at once, for later subscribers."""
         publisher = self._ends["publisher", topic]
         publisher.publish(fill(publisher.msg_type(), json.loads(text)))
         return []
 
     def do_subscribers(self, topic: str, count: str) -> list[str]:
-        """Wait until a publisher of ours has so many subscriptions; how many there are."""
+        """Waits until one of the node's publishers has this many subscriptions; returns their number."""
         publisher = self._ends["publisher", topic]
         self._wait(lambda: publisher.get_subscription_count() == int(count))
         return [str(publisher.get_subscription_count())]
 
     def do_listen(self, topic: str, type_name: str, profile: str) -> list[str]:
-        """Record a topic."""
+        """Records a topic."""
         self._heard[topic] = heard = []
         subscription = self.create_subscription(
             load(type_name), topic, heard.append, PROFILES[profile], callback_group=self._group
@@ -282,24 +285,24 @@ class Fixture(Node):
         return []
 
     def do_heard(self, topic: str, count: str, seconds: str = "10") -> list[str]:
-        """Wait for so many messages; all that came, as JSON."""
+        """Waits for this many messages; returns all, as JSON."""
         heard = self._heard[topic]
         wait_for(lambda: len(heard) >= int(count), float(seconds))
         return [json.dumps(to_plain(each)) for each in list(heard)]
 
     def do_end(self, kind: str, topic: str) -> list[str]:
-        """Take a ``publisher`` or a ``subscription`` away."""
+        """Removes a ``publisher`` or a ``subscription``."""
         getattr(self, f"destroy_{kind}")(self._ends.pop((kind, topic)))
         return []
 
     def do_declare(self, name: str, text: str) -> list[str]:
-        """Have a parameter, with this value (JSON) if it is new."""
+        """Declares a parameter, with this value (JSON) if it is new."""
         if not self.has_parameter(name):
             self.declare_parameter(name, json.loads(text), ParameterDescriptor(dynamic_typing=True))
         return []
 
     def do_publishers(self, topic: str, count: str) -> list[str]:
-        """Wait until a topic has so many publishers; what there is to know of each, as JSON."""
+        """Waits until a topic has this many publishers; returns their properties, as JSON."""
         self._wait(lambda: self.count_publishers(topic) == int(count))
         return [
             json.dumps(
@@ -315,7 +318,7 @@ class Fixture(Node):
         ]
 
     def do_call(self, service: str, type_name: str, text: str, seconds: str = "10") -> list[str]:
-        """Call a service somebody else offers; the response as JSON, or ``["absent"]``, ``["silence"]``."""
+        """Calls a service of another node; returns the response as JSON, or ``["absent"]``, ``["silence"]``."""
         type_ = load(type_name)
         client = self.create_client(type_, service, callback_group=self._group)
         try:
@@ -329,7 +332,7 @@ class Fixture(Node):
             self.destroy_client(client)
 
     def do_offered(self, name: str, wanted: str) -> list[str]:
-        """Wait until a service is (``1``) or isn't (``0``) in the graph; whether it is."""
+        """Waits until a service is (``1``) or isn't (``0``) in the graph; returns whether it is."""
 
         def offered() -> bool:
             return name in dict(self.get_service_names_and_types())
@@ -338,8 +341,10 @@ class Fixture(Node):
         return [str(int(offered()))]
 
     def do_goal(self, action: str, type_name: str, text: str, cancel: str = "0") -> list[str]:
-        """Pursue a goal on an action somebody else offers, cancelled after the first feedback if ``cancel`` is 1;
-        a JSON of ``accepted``, ``status``, ``feedback`` and ``result``. Feedback can be ``heard`` meanwhile."""
+        """Sends a goal to an action of another node, cancelled after the first feedback if ``cancel`` is 1;
+        returns a JSON of ``accepted``, ``status``, ``feedback`` and ``result``. Feedback can be ``heard``
+        meanwhile.
+        """
         type_ = load(type_name)
         feedback = self._heard[action] = []
         client = Pursuer(self, type_, action, callback_group=self._group)
@@ -358,13 +363,13 @@ class Fixture(Node):
                 self._wait(lambda: feedback)
                 self._settled(handle.cancel_goal_async())
             answer = self._settled(ended)
-            told = {"accepted": True, "status": answer.status, "result": to_plain(answer.result)}
-            return [json.dumps({**told, "feedback": to_plain(feedback)})]
+            reported = {"accepted": True, "status": answer.status, "result": to_plain(answer.result)}
+            return [json.dumps({**reported, "feedback": to_plain(feedback)})]
         finally:
             self.leaving.put(client)
 
     def do_cancelled(self, count: str) -> list[str]:
-        """Wait until so many goals of ours were cancelled; how many."""
+        """Waits until this many of the node's own goals were cancelled; returns their number."""
         self._wait(lambda: self.cancelled >= int(count))
         return [str(self.cancelled)]
 
@@ -377,7 +382,7 @@ class Fixture(Node):
 
 
 def main() -> None:
-    """Run until a signal comes."""
+    """Runs until a signal arrives."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Fixture()
     executor = MultiThreadedExecutor(num_threads=12)
@@ -398,9 +403,9 @@ def _spin(executor: MultiThreadedExecutor, leaving: queue.SimpleQueue[ActionClie
                 executor.spin_once()
             except ExternalShutdownException:
                 raise
-            except Exception:  # one callback's fault, such as a client that left while it was answered
+            except Exception:  # an error of one callback, such as a client that left before its answer
                 traceback.print_exc()
-            # By no other thread: this one looks at all action clients when it begins to wait (rclpy 7.1).
+            # Only by this thread: it checks all action clients when it begins to wait (rclpy 7.1).
             with contextlib.suppress(queue.Empty):
                 leaving.get_nowait().destroy()
 

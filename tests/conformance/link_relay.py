@@ -1,6 +1,6 @@
-"""The relay's end of the robot link (protocol/SPEC.md, section 2), played step by step to check a robot.
+"""The relay's side of the robot link (SPEC, section 2), played step by step to check a robot.
 
-It speaks plain dicts, so that it can also say what no honest relay says.
+It uses plain dicts, so that it can also send messages that no correct relay sends.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PATIENCE_AFTER_ANOTHER_NAME = 90.0
 """Seconds until a robot is back: after a loss, and after a relay of another name (SPEC 2.2)."""
 
 FRAME_LIMIT = 2**24
-COMMAND_FRAME = 2**22
+RELAY_JSON_FRAME = 2**22
 JSON, SAMPLE, PART, COMMAND = 0, 1, 3, 5
 RELAY = "conformance relay"
 ENROLMENT_CODE = "conformance"
@@ -41,7 +41,7 @@ _COMMAND = struct.Struct("!IQI")
 
 
 class Sample(NamedTuple):
-    """One message of a topic: the number it was subscribed with, the robot's wall clock (ns), and its body."""
+    """One message of a topic: its subscription number, the robot's wall clock (ns), and its body."""
 
     number: int
     stamp: int
@@ -69,9 +69,9 @@ def command_frame(number: int, stamp: int, source: int, body: bytes) -> bytes:
 
 
 class Link:
-    """One connection a robot has dialled. Pings are answered at once, unless told otherwise.
+    """A connection of a robot. Pings are answered at once by default.
 
-    :param hook: told of every JSON message as it comes
+    :param hook: called with every JSON message
     """
 
     def __init__(self, connection: socket.socket, hook: Callable[[dict[str, Any]], None]) -> None:
@@ -91,30 +91,36 @@ class Link:
     # --- sending ---
 
     def raw(self, data: bytes) -> None:
-        """Bytes as they are. A robot that has hung up meanwhile is no error here."""
+        """Sends bytes unchanged. A robot that has disconnected meanwhile is no error here."""
         with contextlib.suppress(OSError):
             self._connection.sendall(data)
 
     def say(self, op: str, **fields: Any) -> None:
-        """One JSON message."""
+        """Sends a JSON message."""
         self.raw(message(op, **fields))
 
     def sample(self, number: int, body: bytes, age: float = 0.0) -> None:
-        """One sample that can't have been sent more than ``age`` seconds ago; below 0 it lies in the future."""
+        """Sends a sample with a maximum age of ``age`` seconds; below 0 it lies in the future."""
         self.raw(sample_frame(number, max(0, time.monotonic_ns() - int(age * 1e9)), body))
 
-    def command(self, number: int, body: bytes, source: int, age: float = 0.0) -> None:
-        """One command of a source; see :meth:`sample`."""
-        self.raw(command_frame(number, max(0, time.monotonic_ns() - int(age * 1e9)), source, body))
+    def command(
+        self, number: int, body: bytes, source: int, age: float = 0.0, at: float | None = None
+    ) -> None:
+        """Sends a command of a source; see :meth:`sample`.
+
+        :param at: in place of ``age``, the earliest time it can have been sent, seconds of :func:`time.monotonic`
+        """
+        stamp = time.monotonic_ns() - int(age * 1e9) if at is None else int(at * 1e9)
+        self.raw(command_frame(number, max(0, stamp), source, body))
 
     def order(self, op: str, **fields: Any) -> dict[str, Any]:
-        """One order about motion; what the robot answers."""
+        """Sends an order about motion; returns the robot's answer."""
         self._orders += 1
         self.say(op, id=self._orders, **fields)
-        return self.expect("done", id=self._orders)
+        return self.expect("order_result", id=self._orders)
 
     def cut(self) -> None:
-        """End the connection without a word."""
+        """Ends the connection without a message."""
         with self._change:
             self.ended = True
             self._change.notify_all()
@@ -125,7 +131,7 @@ class Link:
     # --- receiving ---
 
     def take(self, what: str, wanted: Callable[[Any], bool], seconds: float = PATIENCE) -> Any:
-        """The next thing that is wanted, a dict or a :class:`Sample`; others are kept."""
+        """The next matching dict or :class:`Sample`; others are kept."""
         until = time.monotonic() + seconds
         with self._change:
             while True:
@@ -160,7 +166,7 @@ class Link:
         return found
 
     def no_sample(self, number: int, seconds: float = ABSENCE) -> None:
-        """What has come is let go; from now on nothing of this number comes."""
+        """Discards received samples; from now on none of this number must arrive."""
         with contextlib.suppress(AssertionError):
             while True:
                 self.expect_sample(number, 0.05)
@@ -171,7 +177,7 @@ class Link:
         raise AssertionError(f"samples of number {number} still come")
 
     def wait_end(self, seconds: float = PATIENCE) -> None:
-        """Wait until the robot hangs up."""
+        """Waits until the robot disconnects."""
         until = time.monotonic() + seconds
         with self._change:
             while not self.ended:
@@ -226,9 +232,9 @@ class Link:
 
 
 class LinkRelay:
-    """Listens for the robot under test, enrols it and registers it, again whenever its link was lost.
+    """Listens for the robot under test, enrols and registers it, and registers it again after each lost link.
 
-    :param robot: the name it has to come with
+    :param robot: its required name
     """
 
     def __init__(self, robot: str, host: str = "127.0.0.1", port: int = 0) -> None:
@@ -250,7 +256,6 @@ class LinkRelay:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
-        """End everything."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -259,7 +264,7 @@ class LinkRelay:
                 each.cut()
 
     def dialled(self, op: str, seconds: float = PATIENCE) -> tuple[Link, dict[str, Any]]:
-        """The next connection that begins with this message; those that ended before it are let go."""
+        """The next connection that begins with this message; ended ones before it are discarded."""
         until = time.monotonic() + seconds
         while True:
             with self._change:
@@ -274,7 +279,7 @@ class LinkRelay:
             time.sleep(0.01)
 
     def enrol(self, patience: float) -> None:
-        """Take the robot's key, for the code."""
+        """Accepts the robot's key for the code."""
         while not self.public_key:
             link, asked = self.dialled("enroll", patience)
             if (asked.get("robot"), asked.get("code")) != (self.robot, ENROLMENT_CODE):
@@ -291,13 +296,13 @@ class LinkRelay:
             link.wait_end()
 
     def challenge(self, link: Link, relay: str = RELAY) -> bytes:
-        """Challenge a robot that said hello; the nonce."""
+        """Challenges a robot after its hello; returns the nonce."""
         nonce = secrets.token_bytes(identity.NONCE_BYTES)
         link.say("challenge", nonce=base64.b64encode(nonce).decode(), relay=relay)
         return nonce
 
     def register(self, patience: float = 0.0, heartbeat: float = HEARTBEAT) -> Link:
-        """Take the robot in when it dials, its proof checked."""
+        """Registers the robot when it connects, with its proof checked."""
         link, self.hello = self.dialled("hello", max(patience, self.patience))
         self.patience = PATIENCE_TO_DIAL
         nonce = self.challenge(link)
@@ -309,7 +314,7 @@ class LinkRelay:
         return link
 
     def control_with(self, heartbeat: float) -> Link:
-        """The control link with this heartbeat, seconds; registered anew if it has another."""
+        """The control link with this heartbeat in seconds; registers again if it has another."""
         if self._control is None or self._control.ended or self._heartbeat != heartbeat:
             if self._control is not None:
                 self._control.cut()
@@ -319,7 +324,7 @@ class LinkRelay:
 
     @property
     def control(self) -> Link:
-        """The control link, registered anew if it was lost."""
+        """The control link; registers again if it was lost."""
         if self._control is None or self._control.ended:
             link = self.register()
             self.facts()
@@ -327,7 +332,7 @@ class LinkRelay:
         return self._control
 
     def facts(self) -> dict[str, Any]:
-        """What the robot tells of itself, once it has; its graph is there then too."""
+        """The robot's description, once it has sent it with its graph."""
         until = time.monotonic() + PATIENCE
         while not self.describe or self.first_graph is None:
             assert time.monotonic() < until, "the robot sent no 'describe' and 'graph' after 'welcome'"
@@ -336,7 +341,7 @@ class LinkRelay:
 
     @contextlib.contextmanager
     def channel(self) -> Iterator[Link]:
-        """A channel link, opened and joined, and closed at the end."""
+        """An open and joined channel link, which is closed at the end."""
         control = self.control
         name, ticket = f"c-{secrets.token_hex(3)}", secrets.token_urlsafe(12)
         control.say("open_channel", channel=name, ticket=ticket)

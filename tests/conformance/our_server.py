@@ -1,4 +1,4 @@
-"""Our own relay and daemon with the fixture node between them and ROS 2, for the suite without ``--url``."""
+"""The relay and a daemon with the fixture node and ROS 2, for the suite without ``--url``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import sys
 from pathlib import Path
 
 from conformance_suite import Server
-from switchboard_domains import free_domain
-from switchboard_processes import BIN, Process, ros_environment
-from switchboard_relay import Relay
-from switchboard_waiting import wait_for
+
+from tests.worlds.processes import BIN, Process, ros_environment
+from tests.worlds.relay_process import Relay
+from tests.worlds.ros_domains import free_domain
+from tests.worlds.waiting import wait_for
 
 ROBOT = "conformance"
 
@@ -52,6 +53,6 @@ class OurServer:
         return server
 
     def stop(self) -> None:
-        """End everything, last one first."""
+        """Ends everything, last one first."""
         for each in reversed(self._running):
             each.stop()

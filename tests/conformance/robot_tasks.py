@@ -1,4 +1,4 @@
-"""What cases of the robot link do with a robot: find what it offers, subscribe, call, drive it."""
+"""Actions of robot link cases on a robot: find its resources, subscribe, call, drive."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DRIVER = 11
 
 
 def sensor(relay: LinkRelay) -> tuple[str, str]:
-    """A topic it publishes often, and its type."""
+    """A topic that it publishes often, and its type."""
     topics = relay.graph["topics"]
     published = [
         name for name, each in topics.items() if each.get("publishers") and not name.endswith("/heard")
@@ -45,23 +45,23 @@ def service(relay: LinkRelay) -> str:
 
 
 def subscribe(link: Link, relay: LinkRelay, number: int = 7, **fields: Any) -> dict[str, Any]:
-    """Subscribe to the sensor; what the robot answers."""
+    """Subscribes to the sensor; returns the robot's answer."""
     topic, type_name = sensor(relay)
     link.say("subscribe", number=number, topic=topic, type=type_name, **fields)
     return link.expect("subscribed", number=number)
 
 
 def stands(link: Link, asked: str, answer: str) -> bool:
-    """Whether what was asked for stands; ``failed`` otherwise."""
-    told = link.take(
+    """Whether the request is in effect; ``failed`` otherwise."""
+    reported = link.take(
         f"'{answer}' or 'failed'", lambda each: isinstance(each, dict) and each["op"] in (answer, "failed")
     )
-    assert told["op"] == answer or told["what"] == asked
-    return bool(told["op"] == answer)
+    assert reported["op"] == answer or reported["request"] == asked
+    return bool(reported["op"] == answer)
 
 
 def fibonacci(relay: LinkRelay, link: Link, order: int, **fields: Any) -> None:
-    """Send a goal, id ``g``, to an action of type Fibonacci."""
+    """Sends a goal, id ``g``, to an action of type Fibonacci."""
     actions = relay.graph["actions"]
     found = sorted(name for name, each in actions.items() if FIBONACCI in each["types"])
     if not found:
@@ -71,7 +71,7 @@ def fibonacci(relay: LinkRelay, link: Link, order: int, **fields: Any) -> None:
 
 
 def wheels(relay: LinkRelay) -> str:
-    """The topic of type Twist that moves it and that it reports on as ``…/heard``."""
+    """The topic of type Twist that moves the robot, with a report of it on ``…/heard``."""
     topics = relay.graph["topics"]
     for name, each in topics.items():
         if f"{name}/heard" in topics and TWIST in each["types"]:
@@ -81,9 +81,9 @@ def wheels(relay: LinkRelay) -> str:
 
 
 class Wheels:
-    """Drives the robot by one channel link, and watches by another what it was told.
+    """Drives the robot by one channel link, and reads reports of its motion by another.
 
-    :param resume: whether it is resumed first, if it is stopped
+    :param resume: whether a stopped robot is resumed first
     """
 
     def __init__(self, relay: LinkRelay, driving: Link, watching: Link, resume: bool = True) -> None:
@@ -93,6 +93,8 @@ class Wheels:
         self.stop_within = policy.get("stop_within_ms", 500) / 1000
         self.driving, self.watching = driving, watching
         self.control = relay.control
+        self._sent = time.monotonic()
+        """When the latest command of a stream was sent, or the resume before it."""
         if resume:
             self.resume()
         self.give(DRIVER)
@@ -100,48 +102,53 @@ class Wheels:
         self._heard_encoding = watching.expect("subscribed", number=1)["encoding"]
         self.topic = topic
         self.advertise()
-        # What the case before has left moving stops by itself.
+        # Motion of the case before stops by itself.
         while self.next_speed(self.stop_within + 0.1):
             pass
 
     def advertise(self) -> None:
-        """Announce commands."""
+        """Advertises commands."""
         self.driving.say("advertise", number=2, topic=self.topic, type=TWIST)
-        self.told = self.driving.expect("advertised", number=2)
+        self.reported = self.driving.expect("advertised", number=2)
 
     def give(self, source: int) -> None:
-        """Give control to a source."""
-        done = self.control.order("control", holder=source, user="the suite", level="operator")
+        """Gives control to a source."""
+        done = self.control.order("control_grant", holder=source, user="the suite", level="operator")
         assert done.get("ok", True), done
 
     def resume(self) -> None:
-        """Let it move again after a stop."""
+        """Resumes it after a stop."""
+        self._sent = time.monotonic()
         done = self.control.order("resume", by="the suite")
         assert done.get("ok", True), done
 
     def streams(self, speed: float, seconds: float) -> None:
-        """Command without a pause; it does not move."""
+        """Commands without a pause; the robot does not move."""
         until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            self.command(speed)
+        while (now := time.monotonic()) < until:
+            # If this process stalls, it counts as a link that does, not as a pause.
+            self.command(speed, at=self._sent)
+            self._sent = now
             assert self.next_speed(0.05) != speed, "it moves"
 
-    def command(self, speed: float, age: float = 0.0, source: int = DRIVER) -> None:
-        """One command."""
-        self.driving.command(2, self.twist(speed), source, age)
+    def command(
+        self, speed: float, age: float = 0.0, source: int = DRIVER, *, at: float | None = None
+    ) -> None:
+        """Sends a command; ``at`` as of :meth:`link_relay.Link.command`."""
+        self.driving.command(2, self.twist(speed), source, age, at)
 
     def twist(self, speed: float) -> bytes:
         """A command's body."""
-        if self.told["encoding"] != "json":
+        if self.reported["encoding"] != "json":
             return CDR + struct.pack("<6d", speed, 0, 0, 0, 0, 0)
         twist = {"linear": {"x": speed, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}
         return json.dumps(twist).encode()
 
     def not_finite(self) -> None:
-        """Commands whose speed is no finite number."""
+        """Commands whose speed is not finite."""
         for speed in (float("nan"), float("inf"), float("-inf")):
             self.command(speed)
-        if self.told["encoding"] == "json":
+        if self.reported["encoding"] == "json":
             for text in (b"null", b"1e999", b"-1e999"):
                 self.driving.command(2, b'{"linear": {"x": ' + text + b'}, "angular": {}}', DRIVER)
 
@@ -158,7 +165,7 @@ class Wheels:
         return None
 
     def start(self, source: int = DRIVER) -> Sample:
-        """Command until it moves; the first report of it. Who must let go first does so by zero."""
+        """Commands until it moves; returns the first report. A zero before releases the controls."""
         until = time.monotonic() + 10
         self.command(0.0, source=source)
         while True:
@@ -170,9 +177,9 @@ class Wheels:
                     return report
 
     def stands(self, moving: Sample) -> float:
-        """Wait until it stands; seconds from the last report of moving, no earlier than ``moving``, to that.
+        """Waits until it stands; returns seconds from the last report of motion, no earlier than ``moving``.
 
-        Zero may overtake the latest command, where another part of the robot says it: what comes next tells.
+        Zero may overtake the latest command, if another part of the robot sends it: the next report decides.
         """
         stood: Sample | None = None
         while True:
@@ -190,13 +197,15 @@ class Wheels:
                 return (stood.stamp - moving.stamp) / 1e9
 
     def never_moves(self, seconds: float = ABSENCE) -> None:
-        """Nothing but standing is reported within this time."""
+        """Only standstill is reported within this time."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             assert not self.next_speed(left), "it moves"
 
     def never_goes(self, speed: float, seconds: float = ABSENCE) -> None:
-        """No command of this speed is obeyed within this time; the last one of another speed may still be reported."""
+        """No command of this speed is obeyed within this time; the last one of another speed may still be
+        reported.
+        """
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             assert self.next_speed(left) != speed, f"it obeys the command of {speed} m/s"

@@ -1,4 +1,6 @@
-"""Robots for the link's cases without ``--listen``: our daemon on ROS 2 with the fixture node, and the examples."""
+"""Robots for the link's cases without ``--listen``: the daemon on ROS 2 with the fixture node, and the
+examples.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +8,9 @@ import sys
 from pathlib import Path
 
 from link_relay import ENROLMENT_CODE
-from switchboard_domains import free_domain
-from switchboard_processes import BIN, Process, ros_environment
+
+from tests.worlds.processes import BIN, Process, ros_environment
+from tests.worlds.ros_domains import free_domain
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[1] / "docs" / "examples"
@@ -32,14 +35,13 @@ class Daemon:
         self._folder = folder
 
     def run(self) -> None:
-        """Dial, once it is enrolled."""
+        """Starts it, once it is enrolled."""
         self._daemon.popen.wait(30)
         self._node.wait_to_say("READY")
         run = [str(BIN / "switchboard-robot"), "run", "--state", str(self._state)]
         self._daemon = Process(run, self._folder, "daemon", self._environment)
 
     def stop(self) -> None:
-        """End."""
         self._daemon.stop()
         self._node.stop()
 
@@ -71,10 +73,9 @@ class JsonRobot:
         self._process = Process(command, folder, self.program.stem)
 
     def run(self) -> None:
-        """It dials by itself."""
+        """It connects by itself."""
 
     def stop(self) -> None:
-        """End."""
         self._process.stop()
 
 
@@ -86,7 +87,7 @@ class SensorRobot(JsonRobot):
         (
             *("test_two_channels", "test_call", "test_old_call_that_moves_nothing", "test_get_interfaces"),
             *("test_motion_is_known", "test_fresh_commands", "test_stops_when_commands_cease"),
-            *("test_says_zero_again", "test_old_commands", "test_old_commands_do_not_keep_it_moving"),
+            *("test_zero_is_repeated", "test_old_commands", "test_old_commands_do_not_keep_it_moving"),
             *("test_commands_of_the_future", "test_no_number", "test_nonsense_for_a_command"),
             *("test_unadvertise_stops", "test_cut_channel_stops", "test_other_samples_are_no_commands"),
             *("test_cut_control_stops", "test_only_the_holder", "test_another_holder", "test_same_holder"),
@@ -95,7 +96,7 @@ class SensorRobot(JsonRobot):
                 "test_stop",
                 "test_stop_outlives_the_link",
                 "test_resume_moves_nothing",
-                "test_zero_is_letting_go",
+                "test_zero_is_a_release",
                 "test_sent_before_the_resume",
                 "test_stall_is_no_silence",
                 "test_sent_before_control_was_lost",

@@ -1,4 +1,4 @@
-"""A rosbridge v2 client for checking servers: text and binary frames as they are, nothing smoothed over."""
+"""A rosbridge v2 client for checking servers: text and binary frames unchanged."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _no_constant(name: str) -> None:
 
 
 def strict_json(text: str) -> Any:
-    """JSON as RFC 8259 has it: no NaN, no Infinity."""
+    """JSON of RFC 8259: no NaN, no Infinity."""
     return json.loads(text, parse_constant=_no_constant)
 
 
@@ -78,10 +78,10 @@ def _paeth(left: int, up: int, corner: int) -> int:
 
 
 class Client:
-    """One websocket to a rosbridge server.
+    """A websocket to a rosbridge server.
 
     :param token: sent as ``Authorization: Bearer``, if there is one
-    :param patience: seconds an answer may take
+    :param patience: timeout of an answer in seconds
     :param options: further ones of ``websockets.sync.client.connect``
     """
 
@@ -108,23 +108,22 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Leave."""
         self._stack.close()
 
     # --- sending ---
 
     def send(self, op: str, **fields: Any) -> None:
-        """One operation."""
+        """Sends an operation."""
         self.send_raw(json.dumps({"op": op, **fields}))
 
     def send_raw(self, data: str | bytes) -> None:
-        """A text message (``str``) or a binary one (``bytes``), as it is."""
+        """Sends a text message (``str``) or a binary one (``bytes``) unchanged."""
         self.connection.send(data)
 
     # --- receiving ---
 
     def receive_raw(self, seconds: float | None = None) -> str | bytes:
-        """The next message as it came."""
+        """The next message, not decoded."""
         return self.connection.recv(timeout=self.patience if seconds is None else seconds)
 
     def receive(self, seconds: float | None = None) -> Any:
@@ -152,11 +151,11 @@ class Client:
             self._passed_over.append(message)
 
     def formed(self, ask: Callable[[], object], seconds: float | None = None) -> None:
-        """Ask until what comes is a PNG or fragments. It is kept for whoever waits for it.
+        """Asks until the answer is a PNG or fragments, which is kept for the next reader.
 
-        A server may send plain JSON while a user's share of its processor is used up (SPEC 1.6).
+        A server may send plain JSON while a user's quota is used up (SPEC 1.6).
 
-        :param ask: has one message sent
+        :param ask: sends one request
         """
         seconds = self.patience if seconds is None else seconds
         end = time.monotonic() + seconds
@@ -169,11 +168,11 @@ class Client:
             self._passed_over.append(message)
             if message["op"] in ("png", "fragment"):
                 return
-            time.sleep(0.1)  # its share comes back by and by
+            time.sleep(0.1)  # the quota refills over time
         raise AssertionError(f"only plain JSON came within {seconds:g} s")
 
     def none(self, op: str, seconds: float = ABSENCE, **like: Any) -> None:
-        """No such message has come, nor comes within this time."""
+        """No such message has arrived, nor arrives within this time."""
         try:
             message = self.until(op, seconds, **like)
         except AssertionError:
@@ -181,7 +180,7 @@ class Client:
         raise AssertionError(f"what should not have come: {str(message)[:300]}")
 
     def all_within(self, op: str, seconds: float, **like: Any) -> list[Any]:
-        """Every such message that comes within this time."""
+        """All such messages that arrive within this time."""
         found = []
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -200,7 +199,7 @@ class Client:
         return sorted(parts, key=lambda part: int(part["num"]))
 
     def closed(self) -> int:
-        """Wait until the server closes; its close code."""
+        """Waits until the server closes; returns its close code."""
         seconds = min(SOON, self.patience)
         end = time.monotonic() + seconds
         try:
@@ -212,10 +211,10 @@ class Client:
             code = self.connection.protocol.close_code
             return -1 if code is None else int(code)
 
-    # --- everyday work ---
+    # --- common operations ---
 
     def call(self, service: str, args: Any = None, seconds: float | None = None, **fields: Any) -> Any:
-        """Call a service; its ``service_response``."""
+        """Calls a service; returns its ``service_response``."""
         call_id = f"call-{next(_ids)}"
         if args is not None:
             fields["args"] = args
@@ -223,7 +222,7 @@ class Client:
         return self.until("service_response", seconds, id=call_id)
 
     def values(self, service: str, args: Any = None, seconds: float | None = None) -> Any:
-        """What a service answers, when it does."""
+        """The values of a service's successful answer."""
         answer = self.call(service, args, seconds)
         assert answer["result"] is True, f"{service} failed: {answer.get('values')}"
         return answer.get("values", {})

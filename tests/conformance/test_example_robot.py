@@ -1,4 +1,4 @@
-"""The robots of docs/examples at a real relay: enrolled, watched, driven, called."""
+"""The robots of docs/examples at a real relay: enrolled, viewed, driven, called."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from robots_under_test import EXAMPLE, SENSOR
-from switchboard_client import Client
-from switchboard_processes import Process
-from switchboard_relay import Relay
-from switchboard_waiting import wait_for
 from websockets.sync.client import connect
+
+from tests.worlds.processes import Process
+from tests.worlds.relay_process import Relay
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 NAME = "tin-man"
 
 
 def command(relay: Relay, code: str, state: Path, program: Path = EXAMPLE) -> list[str]:
-    """How the robot is started."""
+    """The command line of the robot."""
     return [sys.executable, str(program), "127.0.0.1", str(relay.robots_port), NAME, code, str(state)]
 
 
 class World:
-    """A relay with the robot, and somebody who may drive it."""
+    """A relay with the robot, and an operator."""
 
     def __init__(self, folder: Path) -> None:
         self.relay = Relay(folder)
@@ -44,16 +45,15 @@ class World:
         self.wait()
 
     def wait(self) -> None:
-        """Until it is online."""
+        """Waits until it is online."""
         wait_for("the robot is online", lambda: self.relay.state_of(NAME) != "offline")
 
     def restart(self) -> None:
-        """Start it again; its code is used up."""
+        """Starts it again, without a code."""
         self.robot.stop()
         self.robot = Process(self._command, self._folder, "robot")
 
     def stop(self) -> None:
-        """End both."""
         self.robot.stop()
         self.relay.stop()
 
@@ -76,12 +76,12 @@ def client(world: World) -> Iterator[Client]:
 
 
 def speed(client: Client) -> float:
-    """The next speed its motors were told."""
+    """The next speed of its motors."""
     return float(client.until(op="publish", topic="/cmd_vel/heard")["msg"]["linear"]["x"])
 
 
 def drive(client: Client) -> None:
-    """Drive until it moves; who has driven a moment ago need not let go of anything."""
+    """Drives until it moves; an earlier drive needs no release."""
     assert client.call("/relay/take_control")["values"]["success"]
     client.send(op="subscribe", topic="/cmd_vel/heard")
     for _ in range(200):
@@ -104,13 +104,13 @@ def test_its_sensor_is_watched(client: Client) -> None:
 
 
 def test_its_service_is_called(client: Client) -> None:
-    """A call is answered, and one of a service it does not have is answered in words."""
+    """A call is answered, and one of a missing service gets a reason."""
     assert client.call("/beep")["values"] == {"success": True, "message": "beep"}
     assert client.call("/no_such_service")["result"] is False
 
 
 def test_it_is_driven_and_stops_by_itself(client: Client) -> None:
-    """Commands move it; when they cease it stands, and says so."""
+    """Commands move it; when they cease it stands, and reports so."""
     drive(client)
     wait_for("it stands", lambda: speed(client) == 0)
 
@@ -124,7 +124,7 @@ def test_it_stops_when_its_driver_leaves(world: World, client: Client) -> None:
 
 
 def test_it_comes_back(world: World) -> None:
-    """Started again it needs no new code, and its clients go on."""
+    """After a restart it needs no new code, and its clients continue."""
     with world.relay.connect(NAME, world.token) as client:
         client.send(op="subscribe", topic="/temperature", type="std_msgs/msg/Float64")
         client.until(op="publish", topic="/temperature")
@@ -133,7 +133,9 @@ def test_it_comes_back(world: World) -> None:
 
 
 def test_a_sensor_is_watched(world: World, tmp_path: Path) -> None:
-    """The robot that only measures serves subscribers, refuses the rest in words, and comes back without a code."""
+    """The robot that only measures serves subscribers, refuses other requests with a reason, and reconnects
+    without a code.
+    """
     name = "thermometer"
     code = world.relay.cli("robot", "add", name)["enrolment_code"]
     world.relay.cli("right", "grant", "driver", name, "operator")
@@ -177,7 +179,7 @@ def self_signed(folder: Path) -> tuple[str, str]:
 
 
 def test_it_speaks_tls(tmp_path: Path) -> None:
-    """With its line for TLS it serves where the certificate is trusted, and says why where it is not."""
+    """With its line for TLS it serves with a trusted certificate, and gives the reason otherwise."""
     program = tmp_path / "tls_robot.py"
     program.write_text(
         EXAMPLE.read_text().replace("# With TLS: ", "").replace("import socket", "import socket, ssl")
@@ -207,8 +209,8 @@ def test_it_speaks_tls(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("program", [EXAMPLE, SENSOR], ids=["json_robot", "sensor_robot"])
-def test_a_wrong_code_is_refused_in_words(world: World, tmp_path: Path, program: Path) -> None:
-    """With a code that is none it ends, and keeps no key."""
+def test_a_wrong_code_is_refused_with_a_reason(world: World, tmp_path: Path, program: Path) -> None:
+    """With an invalid code it ends, and stores no key."""
     state = tmp_path / "robot.json"
     stranger = Process(command(world.relay, "guess", state, program), tmp_path, "stranger")
     try:
@@ -221,7 +223,7 @@ def test_a_wrong_code_is_refused_in_words(world: World, tmp_path: Path, program:
 
 
 def test_it_ends_in_order(world: World) -> None:
-    """A robot that is told to end while it drives ends in order, with status 0."""
+    """A robot that gets a signal during a drive exits with status 0."""
     with world.relay.connect(NAME, world.token) as client:
         drive(client)
         assert world.robot.stop() == 0

@@ -1,4 +1,4 @@
-"""The suite's own machinery: what becomes of a case, the table, the exit status."""
+"""The suite's own machinery: results of cases, the table, the exit status."""
 
 from __future__ import annotations
 
@@ -113,14 +113,15 @@ def test_last(client):
 
 
 class FakeServer:
-    """A rosbridge server with the fixture node behind it, as far as the suite itself needs one. It hangs when told.
+    """A rosbridge server with the fixture node, as far as the suite needs one. It hangs on request.
 
-    :param again: a file; while it is there the server does not hang
+    :param again: a file; while it exists the server does not hang
     """
 
     def __init__(self, again: Path) -> None:
         self._again = again
         self._hangs = False
+        self.has_rosapi = True
         self.answered = 0
         self._server = serve(self._client, "127.0.0.1", 0)
         self.url = f"ws://127.0.0.1:{self._server.socket.getsockname()[1]}"
@@ -149,6 +150,11 @@ class FakeServer:
         if said["op"] == "subscribe":
             about = json.dumps({"version": FIXTURE_VERSION, "example_interfaces": False})
             return {"op": "publish", "msg": {"data": about}}
+        if said["op"] == "kill rosapi":
+            self.has_rosapi = False
+            return None
+        if said["service"].startswith("/rosapi/") and not (self.has_rosapi or self._again.exists()):
+            return None
         values = {"success": True, "message": "inverted"}
         if said["service"] == "/conformance/do":
             values = {"result": {"names": []}}
@@ -156,10 +162,10 @@ class FakeServer:
 
 
 def run(folder: Path, cases: str, *options: str) -> subprocess.CompletedProcess[str]:
-    """Run cases as ``make conformance`` does."""
+    """Runs cases as ``make conformance`` does."""
     file = folder / "test_cases.py"
     file.write_text(cases)
-    paths = [str(HERE), str(ROOT / "protocol"), str(ROOT / "tests" / "harness")]
+    paths = [str(HERE), str(ROOT), str(ROOT / "protocol")]
     command = [
         sys.executable,
         "-m",
@@ -195,7 +201,7 @@ def test_without_the_target_they_are(tmp_path: Path) -> None:
     assert "2 passed, 1 failed, 1 not tried, 1 not offered" in done.stdout
 
 
-def test_a_failure_is_one_whatever_the_target(tmp_path: Path) -> None:
+def test_a_failure_is_one_for_every_target(tmp_path: Path) -> None:
     """A case without a mark that fails is a failure for every target; its title and remark stand as they are."""
     done = run(tmp_path, CASES + BAD, "--target", "rosbridge_suite")
     assert done.returncode == 1
@@ -203,8 +209,8 @@ def test_a_failure_is_one_whatever_the_target(tmp_path: Path) -> None:
     assert "assert 'this' == 'that'" in done.stdout
 
 
-def test_a_server_that_is_not_there_is_told_in_a_sentence(tmp_path: Path) -> None:
-    """An address nobody listens at ends the run with status 2 and says so."""
+def test_an_unreachable_server_is_reported_in_a_sentence(tmp_path: Path) -> None:
+    """An address without a listener ends the run with status 2 and an error."""
     cases = "def test_it(server):\n    pass\n"
     done = run(tmp_path, cases, "--url", "ws://127.0.0.1:1")
     assert done.returncode == 2
@@ -212,16 +218,16 @@ def test_a_server_that_is_not_there_is_told_in_a_sentence(tmp_path: Path) -> Non
 
 
 def test_cases_of_the_spec_alone_are_no_failures_of_the_target(tmp_path: Path) -> None:
-    """Nor is what their fixtures ask for, and what is left behind by them. Without the target named they are."""
+    """This includes failures of their fixtures and cleanups. Without the target named they are failures."""
     done = run(tmp_path, SPEC_CASES, "--target", "rosbridge_suite")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "1 passed, 3 spec only" in done.stdout
-    assert "a rule of this project's SPEC.md, not of rosbridge v2" in done.stdout.replace("\n", " ")
+    assert "a rule of this project's SPEC, not of rosbridge v2" in done.stdout.replace("\n", " ")
     assert run(tmp_path, SPEC_CASES).returncode == 1
 
 
 def test_after_a_server_hangs_the_cases_that_are_left_are_not_tried(tmp_path: Path) -> None:
-    """Each would only cost time; the remark says since when."""
+    """Each would only take time; the remark says since when."""
     with FakeServer(tmp_path / "again") as server:
         done = run(tmp_path, HANGS, "--url", server.url, "--answers-within", "1")
     assert done.returncode == 1
@@ -230,7 +236,7 @@ def test_after_a_server_hangs_the_cases_that_are_left_are_not_tried(tmp_path: Pa
 
 
 def test_a_server_that_hangs_is_started_again_by_a_command(tmp_path: Path) -> None:
-    """The cases that are left are tried then."""
+    """The remaining cases are tried then."""
     again = tmp_path / "again"
     with FakeServer(again) as server:
         restart = f"touch {shlex.quote(str(again))}"
@@ -238,8 +244,68 @@ def test_a_server_that_hangs_is_started_again_by_a_command(tmp_path: Path) -> No
     assert "3 passed, 1 failed" in done.stdout
 
 
+KILLS = """
+from conformance_suite import case
+
+@case("bad", "section 1")
+def test_kill(client):
+    client.send("kill rosapi")
+    client.values("/rosapi/nodes")
+
+@case("good", "section 2")
+def test_later(client):
+    client.lives()
+"""
+ASKS = """
+from conformance_suite import case
+
+@case("rosapi nodes", "section 1")
+def test_nodes(client):
+    client.values("/rosapi/nodes")
+
+@case("good", "section 2")
+def test_other(client):
+    client.lives()
+"""
+
+
+def test_a_rosapi_that_died_is_noticed(tmp_path: Path) -> None:
+    """Each case that asks it would only take time."""
+    with FakeServer(tmp_path / "again") as server:
+        done = run(tmp_path, KILLS, "--url", server.url, "--answers-within", "2")
+    assert "1 failed, 1 not tried" in done.stdout
+    assert "rosapi has not answered any more since test_kill" in " ".join(done.stdout.split())
+
+
+def test_a_rosapi_that_died_is_started_again_by_a_command(tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    with FakeServer(again) as server:
+        restart = f"touch {shlex.quote(str(again))}"
+        done = run(tmp_path, KILLS, "--url", server.url, "--answers-within", "2", "--restart", restart)
+    assert "1 passed, 1 failed" in done.stdout
+
+
+def test_without_a_rosapi_its_cases_are_not_tried(tmp_path: Path) -> None:
+    with FakeServer(tmp_path / "again") as server:
+        server.has_rosapi = False
+        done = run(tmp_path, ASKS, "--url", server.url, "--answers-within", "2")
+    assert "1 passed, 1 not tried" in done.stdout
+    assert "rosapi did not answer at the start" in " ".join(done.stdout.split())
+
+
+def test_each_file_has_a_fresh_server(tmp_path: Path) -> None:
+    """The server is started again between two files."""
+    (tmp_path / "test_before.py").write_text(ASKS)
+    with FakeServer(tmp_path / "again") as server:
+        restart = f"echo again >>{shlex.quote(str(tmp_path / 'restarts'))}"
+        options = ["--url", server.url, "--answers-within", "2", "--restart", restart]
+        done = run(tmp_path, ASKS, *options, str(tmp_path / "test_before.py"))
+    assert "4 passed" in done.stdout
+    assert (tmp_path / "restarts").read_text() == "again\n"
+
+
 @pytest.mark.parametrize("message", ["the fixture node is of another version", "not to be seen"])
-def test_a_fixture_node_that_does_not_fit_is_told_in_a_sentence(
+def test_a_fixture_node_that_does_not_match_is_reported_in_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: str
 ) -> None:
     """Before any case is tried."""

@@ -14,22 +14,23 @@ import psycopg
 import pytest
 
 from relay_db.engine import Database
+from tests.worlds.empty_database import write_empty_database
 
 EMPTY = "template0"
 
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[str]:
-    """URL of the database ``postgres`` of a server of our own.
+    """URL of the database ``postgres`` of a new server.
 
-    Not in pytest's folder: the next run that starts closes that to other users, and under root the server is
-    another user's.
+    Outside pytest's folder: the next run closes that to other users, and under root the server runs as
+    another user.
     """
     folder = Path(tempfile.mkdtemp(prefix="pg-of-tests-"))
     server = pgserver.get_server(folder / "data", cleanup_mode="stop")
     try:
         with psycopg.connect(server.get_uri(), autocommit=True) as connection:
-            # nothing here needs to outlive a power cut
+            # no data here needs to survive a power cut
             connection.execute("ALTER SYSTEM SET fsync = off")
             connection.execute("SELECT pg_reload_conf()")
         yield server.get_uri()
@@ -44,7 +45,7 @@ Copies = Callable[[str], AbstractContextManager[str]]
 
 @pytest.fixture(scope="session")
 def copies(postgres: str) -> Iterator[Copies]:
-    """Databases for as long as they are needed."""
+    """Databases for the duration of a block."""
     numbers = count(1)
     assert "/postgres?" in postgres
     with psycopg.connect(postgres, autocommit=True) as connection:
@@ -76,6 +77,13 @@ def sqlite_url(tmp_path: Path) -> str:
 
 
 @pytest.fixture
+def full_sqlite_url(sqlite_url: str) -> str:
+    """URL of a SQLite database with all tables."""
+    write_empty_database(Path(sqlite_url.removeprefix("sqlite:///")))
+    return sqlite_url
+
+
+@pytest.fixture
 def postgres_url(copies: Copies, with_tables: str) -> Iterator[str]:
     """URL of a PostgreSQL database with all tables."""
     with copies(with_tables) as url:
@@ -96,7 +104,7 @@ def empty_url(request: pytest.FixtureRequest) -> str:
     return made
 
 
-@pytest.fixture(params=["sqlite_url", "postgres_url"], ids=["sqlite", "postgresql"])
+@pytest.fixture(params=["full_sqlite_url", "postgres_url"], ids=["sqlite", "postgresql"])
 def url(request: pytest.FixtureRequest) -> str:
     """URL of the database of :func:`database`, of each kind in turn."""
     made: str = request.getfixturevalue(request.param)
@@ -107,16 +115,14 @@ def url(request: pytest.FixtureRequest) -> str:
 def database(url: str) -> Iterator[Database]:
     """A database with all tables, of each kind in turn."""
     opened = Database(url)
-    opened.upgrade()
     yield opened
     opened.close()
 
 
 @pytest.fixture
-def sqlite(sqlite_url: str) -> Iterator[Database]:
+def sqlite(full_sqlite_url: str) -> Iterator[Database]:
     """A SQLite database with all tables."""
-    opened = Database(sqlite_url)
-    opened.upgrade()
+    opened = Database(full_sqlite_url)
     yield opened
     opened.close()
 
@@ -125,6 +131,5 @@ def sqlite(sqlite_url: str) -> Iterator[Database]:
 def postgresql(postgres_url: str) -> Iterator[Database]:
     """A PostgreSQL database with all tables."""
     opened = Database(postgres_url)
-    opened.upgrade()
     yield opened
     opened.close()

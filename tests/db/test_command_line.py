@@ -1,4 +1,4 @@
-"""The admin command line on PostgreSQL: the same words, another database."""
+"""The admin command line on PostgreSQL: the same commands, another database."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_command_line_works_on_postgresql(empty_postgres_url: str, tmp_path:
 
 
 def test_a_missing_server_is_exit_code_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sentence without the password."""
+    """The error does not contain the password."""
     monkeypatch.setenv("SWITCHBOARD_DB", f"postgresql://me:hunter22@/x?host={tmp_path}")
     result = CliRunner().invoke(main, ["user", "list"])
     assert result.exit_code == 3

@@ -1,4 +1,4 @@
-"""Transactions, and what becomes of the database's own troubles."""
+"""Transactions, and errors of the database."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from relay_protocol.errors import Invalid, Unavailable
 
 
 def test_a_transaction_is_committed_at_its_end(database: Database) -> None:
-    """What one transaction wrote, the next session reads."""
     with database.begin() as s:
         queries.add_robot(s, "rover")
     with database.reading() as s:
@@ -22,7 +21,7 @@ def test_a_transaction_is_committed_at_its_end(database: Database) -> None:
 
 
 def test_an_error_rolls_the_transaction_back(database: Database) -> None:
-    """An error in the body leaves nothing behind and goes on as it is."""
+    """An error in the block leaves nothing behind and is raised unchanged."""
     with pytest.raises(Invalid), database.begin() as s:
         queries.add_robot(s, "rover")
         queries.add_robot(s, "rover")
@@ -31,7 +30,7 @@ def test_an_error_rolls_the_transaction_back(database: Database) -> None:
 
 
 def test_a_reading_session_cannot_write(database: Database) -> None:
-    """A change through reading() is refused by the database itself, and later changes are not."""
+    """The database refuses a change through reading(); later changes succeed."""
     with pytest.raises(Unavailable), database.reading() as s:
         queries.add_robot(s, "rover")
     with database.begin() as s:
@@ -39,7 +38,7 @@ def test_a_reading_session_cannot_write(database: Database) -> None:
 
 
 def test_a_reading_session_sees_one_state(database: Database) -> None:
-    """A change made meanwhile is not seen by a session that has begun to read."""
+    """A change made meanwhile is not visible in a reading session that has begun."""
     with database.reading() as reader:
         before = queries.revision(reader)
         with database.begin() as s:
@@ -48,13 +47,12 @@ def test_a_reading_session_sees_one_state(database: Database) -> None:
 
 
 def test_sqlite_has_one_writer_and_postgresql_several(sqlite: Database, postgresql: Database) -> None:
-    """``writers`` tells how many threads are of use."""
     assert sqlite.writers == 1
     assert postgresql.writers > 1
 
 
-def test_a_locked_row_is_told_in_words(postgresql: Database) -> None:
-    """On PostgreSQL a change that waits too long for another is given up with a sentence."""
+def test_a_locked_row_is_unavailable(postgresql: Database) -> None:
+    """On PostgreSQL a change that waits too long for another fails with a reason."""
     with postgresql.begin() as holder:
         queries.add_robot(holder, "one")
         with pytest.raises(Unavailable, match="locked"), postgresql.begin() as s:
@@ -62,7 +60,7 @@ def test_a_locked_row_is_told_in_words(postgresql: Database) -> None:
             queries.add_robot(s, "two")
 
 
-def test_two_changes_that_contradict_are_told_in_words(postgresql: Database) -> None:
+def test_two_conflicting_changes_are_unavailable(postgresql: Database) -> None:
     """On PostgreSQL the second of two users of one name, added at once, is refused by the constraint."""
     with postgresql.begin() as s:
         realm = s.execute(text("SELECT id FROM realm")).scalar_one()
@@ -70,12 +68,18 @@ def test_two_changes_that_contradict_are_told_in_words(postgresql: Database) -> 
             "INSERT INTO user_account (realm_id, name, admin, disabled) VALUES (:realm, 'ann', false, false)"
         )
         s.execute(insert, {"realm": realm})
-    with pytest.raises(Unavailable, match="same time"), postgresql.begin() as s:
+    with pytest.raises(Unavailable, match="conflicts with another"), postgresql.begin() as s:
         s.execute(insert, {"realm": realm})
 
 
+def test_a_text_with_the_character_nul_is_invalid(postgresql: Database) -> None:
+    """PostgreSQL stores none; SQLite finds nothing by it."""
+    with pytest.raises(Invalid, match="NUL"), postgresql.reading() as s:
+        queries.find_role(s, "default", "a\0b")
+
+
 def test_lost_connections_are_replaced(postgresql: Database, postgres_url: str) -> None:
-    """When the server drops our connections, the next session simply gets a new one."""
+    """When the server drops the connections, the next session gets a new one."""
     with postgresql.reading() as s:
         before = queries.revision(s)
     with psycopg.connect(postgres_url, autocommit=True) as other:
@@ -87,8 +91,8 @@ def test_lost_connections_are_replaced(postgresql: Database, postgres_url: str) 
         assert queries.revision(s) == before
 
 
-def test_a_connection_lost_in_a_transaction_is_told_in_words(postgresql: Database, postgres_url: str) -> None:
-    """When the server goes in the middle, the change fails with a sentence and nothing is written."""
+def test_a_connection_lost_in_a_transaction_is_unavailable(postgresql: Database, postgres_url: str) -> None:
+    """The change fails with a reason and nothing is written."""
     with pytest.raises(Unavailable), postgresql.begin() as s:
         queries.add_robot(s, "rover")
         with psycopg.connect(postgres_url, autocommit=True) as other:
@@ -101,8 +105,8 @@ def test_a_connection_lost_in_a_transaction_is_told_in_words(postgresql: Databas
         assert queries.list_robots(s) == []
 
 
-def test_a_server_that_is_not_there_is_told_in_words(free_port: int) -> None:
-    """Nothing listens: a sentence, in which neither user nor password occurs."""
+def test_an_absent_server_has_a_clear_error(free_port: int) -> None:
+    """The error contains neither user nor password."""
     database = Database(f"postgresql://someone:hunter22@127.0.0.1:{free_port}/switchboard")
     with pytest.raises(Unavailable, match="can't be reached") as caught:
         database.upgrade()
@@ -112,7 +116,7 @@ def test_a_server_that_is_not_there_is_told_in_words(free_port: int) -> None:
 
 @pytest.fixture
 def free_port() -> int:
-    """A port nobody listens on."""
+    """An unused port."""
     import socket
 
     with socket.socket() as taken:
@@ -120,8 +124,8 @@ def free_port() -> int:
         return int(taken.getsockname()[1])
 
 
-def test_a_missing_database_is_told_in_words(postgres_url: str) -> None:
-    """A server without the named database says so."""
+def test_a_missing_database_has_a_clear_error(postgres_url: str) -> None:
+    """A server without the named database."""
     database = Database(postgres_url.replace("/test_", "/nowhere_"))
     with pytest.raises(Unavailable, match="refuses the connection"):
         database.upgrade()
@@ -140,11 +144,11 @@ def test_the_usual_ways_to_name_postgresql_work(empty_postgres_url: str, scheme:
 @pytest.mark.parametrize(
     ("url", "words"),
     [
-        ("nonsense", "no database URL"),
+        ("nonsense", "not a database URL"),
         ("mysql://host/name", "mysql"),
         ("sqlite://", "file"),
         ("sqlite:///:memory:", "file"),
-        ("sqlite:///some.db?mode=ro", "without anything after"),
+        ("sqlite:///some.db?mode=ro", "nothing after it"),
     ],
 )
 def test_a_url_that_cannot_be_is_refused(url: str, words: str) -> None:
@@ -154,14 +158,13 @@ def test_a_url_that_cannot_be_is_refused(url: str, words: str) -> None:
 
 
 def test_without_the_driver_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PostgreSQL without psycopg: the sentence tells which extra to install."""
     monkeypatch.setitem(sys.modules, "psycopg", None)
     with pytest.raises(Invalid, match="extra 'postgresql'"):
         Database("postgresql://localhost/switchboard")
 
 
 def test_errors_show_no_parameters(database: Database) -> None:
-    """Values of a failed statement, among them hashes, stay out of errors and so out of logs."""
+    """Values of a failed statement, among them hashes, stay out of errors and logs."""
     insert = text("INSERT INTO realm (id, name) VALUES (1, :name)")
     with pytest.raises(Unavailable) as caught, database.connection() as connection:
         connection.execute(insert, {"name": "f00dface"})

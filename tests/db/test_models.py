@@ -1,4 +1,4 @@
-"""What the tables themselves refuse, whoever writes."""
+"""Constraints of the tables, for every writer."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RIGHT = "INSERT INTO robot_right (robot_id, user_id, group_id, level, allow, den
 TOKEN = "INSERT INTO access_token (user_id, token_hash, kind, label, created) VALUES "
 
 ENTRY = (
-    "INSERT INTO directory_entry "
+    "INSERT INTO service_registry_entry "
     "(id, realm_id, user_id, kind, name, address, description, data, ttl, registered, expires) VALUES "
 )
 
@@ -78,14 +78,14 @@ ENTRY = (
     ],
 )
 def test_the_tables_refuse(filled: Database, statement: str) -> None:
-    """A row that can't be is refused by a constraint of the database."""
+    """An invalid row violates a constraint of the database."""
     with pytest.raises(Unavailable) as caught, filled.connection() as connection:
         connection.execute(text(statement))
     assert isinstance(caught.value.__cause__, IntegrityError)
 
 
 def test_numbers_are_never_given_out_twice(filled: Database) -> None:
-    """A new token does not inherit the number of a removed one, by which an open session may remember it."""
+    """A new token must not get the number of a removed one, which an open session may still use."""
     numbers = []
     for _ in range(2):
         with filled.begin() as s:

@@ -1,4 +1,4 @@
-"""Names of people and groups, and text that is kept."""
+"""Names of users and groups, and stored text."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_db.names import label, normal_name, sanitise
+from relay_db.names import checked_label, normal_name, sanitise
 from relay_protocol.errors import Invalid
 
 
@@ -15,7 +15,7 @@ from relay_protocol.errors import Invalid
     [("Ann", "ann"), ("ÅSA", "åsa"), ("Straße", "strasse"), ("ﬁn", "fin"), ("a.b", "a.b")],
 )
 def test_a_name_has_one_form(written: str, name: str) -> None:
-    """Case and compatibility forms of a name are the same name."""
+    """Case and compatibility forms count as the same name."""
     assert normal_name(written) == name
 
 
@@ -41,14 +41,14 @@ def test_a_name_has_one_form(written: str, name: str) -> None:
     ],
 )
 def test_a_name_that_cannot_be_is_refused(name: str) -> None:
-    """Blanks, control and direction characters, half characters and leading marks are refused in words."""
+    """Blanks, control and direction characters, surrogates and leading marks are refused with a reason."""
     with pytest.raises(Invalid, match="the name of a user must"):
         normal_name(name, "name of a user")
 
 
 @given(st.text(max_size=70))
 def test_the_form_of_a_name_is_final(text: str) -> None:
-    """Normalising what was normalised changes nothing, or the name is refused."""
+    """Normalising again changes nothing, or the name is refused."""
     try:
         name = normal_name(text)
     except Invalid:
@@ -57,23 +57,22 @@ def test_the_form_of_a_name_is_final(text: str) -> None:
 
 
 def test_a_label_is_one_printable_line() -> None:
-    """Labels are taken as they are or refused."""
-    assert label("Lab 3, left", "label") == "Lab 3, left"
+    """Labels are stored unchanged or refused."""
+    assert checked_label("Lab 3, left", "label") == "Lab 3, left"
     for bad in ("two\nlines", "\x1b[2J", "a\ufffd", "x" * 256):
         with pytest.raises(Invalid, match="the label must be one printable line"):
-            label(bad, "label")
+            checked_label(bad, "label")
 
 
 @given(st.text(max_size=600), st.integers(min_value=8, max_value=300))
 def test_recorded_text_is_printable_and_fits(text: str, length: int) -> None:
-    """Whatever comes, what is kept is printable and no longer than its column."""
     kept = sanitise(text, length)
     assert kept.isprintable()
     assert len(kept) <= length
 
 
-def test_recorded_text_shows_what_was_there() -> None:
-    """Plain text stays; the rest is escaped; what was cut is marked."""
+def test_sanitised_text_shows_escaped_characters() -> None:
+    """Plain text stays; the rest is escaped; cuts are marked."""
     assert sanitise("ann") == "ann"
     assert sanitise("a\x00\ud800\n") == "a\\x00\\ud800\\n"
     assert sanitise("x" * 20, 10) == "x" * 9 + "…"

@@ -1,4 +1,4 @@
-"""The embedded database: durable, private, and its troubles in words."""
+"""The embedded database: durable, private, and its errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def open_umask() -> Iterator[None]:
 
 @pytest.mark.usefixtures("open_umask")
 def test_the_files_are_for_their_owner_only(sqlite_url: str, tmp_path: Path) -> None:
-    """The folder and all files of the database are closed to others, whatever the umask."""
+    """Folder and files of the database are closed to others, for any umask."""
     database = Database(sqlite_url)
     database.upgrade()
     with database.begin() as s:
@@ -40,7 +40,7 @@ def test_the_files_are_for_their_owner_only(sqlite_url: str, tmp_path: Path) -> 
 
 
 def test_a_world_readable_file_is_closed(sqlite_url: str, tmp_path: Path) -> None:
-    """A database that came with an open mode loses it when it is opened; the group's rights stay."""
+    """A database with an open mode loses it when it is opened; the group's rights stay."""
     Database(sqlite_url).close()
     path = tmp_path / "data" / "switchboard.db"
     path.chmod(0o664)
@@ -60,7 +60,7 @@ def test_the_settings_are_those_of_a_durable_database(sqlite: Database) -> None:
 
 
 def test_odd_paths_work(tmp_path: Path) -> None:
-    """Blanks, percent signs and hashes in a path are taken as they are."""
+    """Blanks, percent signs and hashes in a path work."""
     path = tmp_path / "a b%20#c" / "d.db"
     database = Database(f"sqlite:///{path}")
     database.upgrade()
@@ -69,7 +69,7 @@ def test_odd_paths_work(tmp_path: Path) -> None:
 
 
 def test_a_restored_dump_gets_a_write_ahead_log(sqlite_url: str, tmp_path: Path) -> None:
-    """A database that came with a rollback journal is switched when it is opened."""
+    """A database with a rollback journal is switched when it is opened."""
     Database(sqlite_url).close()
     path = tmp_path / "data" / "switchboard.db"
     raw = sqlite3.connect(path)
@@ -82,10 +82,10 @@ def test_a_restored_dump_gets_a_write_ahead_log(sqlite_url: str, tmp_path: Path)
     database.close()
 
 
-def test_a_locked_database_is_told_in_words(
+def test_a_locked_database_has_a_clear_error(
     sqlite_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another process holds the write lock for too long: a sentence; afterwards it works again."""
+    """Another process holds the write lock too long; afterwards it works again."""
     monkeypatch.setattr(edge, "BUSY_SECONDS", 0.05)
     database = Database(sqlite_url)
     database.upgrade()
@@ -102,8 +102,8 @@ def test_a_locked_database_is_told_in_words(
     database.close()
 
 
-def test_a_full_disk_is_told_in_words(sqlite: Database) -> None:
-    """No page can be added: a sentence, nothing half-written, and reading goes on."""
+def test_a_full_disk_has_a_clear_error(sqlite: Database) -> None:
+    """No page can be added: nothing is half-written, and reading continues."""
     with pytest.raises(Unavailable, match="full"), sqlite.begin() as s:
         pages = s.connection().exec_driver_sql("PRAGMA page_count").scalar_one()
         s.connection().exec_driver_sql(f"PRAGMA max_page_count = {pages}")
@@ -113,8 +113,8 @@ def test_a_full_disk_is_told_in_words(sqlite: Database) -> None:
         assert queries.list_robots(s) == []
 
 
-def test_a_vanished_file_is_told_in_words_and_not_made_anew(sqlite_url: str, tmp_path: Path) -> None:
-    """A database that disappears is an error, not a fresh one without users."""
+def test_a_missing_file_is_an_error_and_not_created_again(sqlite_url: str, tmp_path: Path) -> None:
+    """A database that disappears is an error, not a new one without users."""
     database = Database(sqlite_url)
     path = tmp_path / "data" / "switchboard.db"
     for each in path.parent.iterdir():
@@ -124,18 +124,18 @@ def test_a_vanished_file_is_told_in_words_and_not_made_anew(sqlite_url: str, tmp
     assert not path.exists()
 
 
-def test_a_file_that_is_no_database_is_told_in_words(sqlite_url: str, tmp_path: Path) -> None:
-    """Something else under the name: a sentence, and the file stays as it was."""
+def test_a_file_that_is_not_a_database_has_a_clear_error(sqlite_url: str, tmp_path: Path) -> None:
+    """The file stays as it was."""
     path = tmp_path / "data" / "switchboard.db"
     path.parent.mkdir()
     path.write_bytes(b"a letter to aunt Emma\n" * 100)
-    with pytest.raises(Unavailable, match="no SQLite database"):
+    with pytest.raises(Unavailable, match="not an SQLite database"):
         Database(sqlite_url)
     assert path.read_bytes() == b"a letter to aunt Emma\n" * 100
 
 
-def test_a_folder_that_cannot_be_made_is_told_in_words(tmp_path: Path) -> None:
-    """A file where the folder should be: a sentence without the path."""
+def test_a_folder_that_cannot_be_created_has_a_clear_error(tmp_path: Path) -> None:
+    """For example with a file in place of the folder; the error does not contain the path."""
     (tmp_path / "taken").write_text("")
     with pytest.raises(Unavailable, match="can't be used") as caught:
         Database(f"sqlite:///{tmp_path}/taken/switchboard.db")
@@ -143,7 +143,7 @@ def test_a_folder_that_cannot_be_made_is_told_in_words(tmp_path: Path) -> None:
 
 
 def test_a_second_database_in_one_process_costs_the_first_no_lock(sqlite_url: str) -> None:
-    """Another process finds the first one's locks and leaves its write-ahead log alone."""
+    """Another process finds the first one's locks and does not touch its write-ahead log."""
     first = Database(sqlite_url)
     first.upgrade()
     with first.begin() as session:

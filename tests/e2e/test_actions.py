@@ -1,4 +1,4 @@
-"""Actions both ways: goals of clients pursued by real nodes, goals of real nodes pursued by clients."""
+"""Actions in both directions: real nodes execute goals of clients, clients execute goals of real nodes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment, running
-from switchboard_waiting import wait_for
 
 from tests.robot_client.ros import Peer
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 CLIENTS = Path(__file__).parent / "clients"
 FIBONACCI = "example_interfaces/action/Fibonacci"
@@ -36,31 +36,55 @@ def peer(world: Any) -> Iterator[Peer]:
 
 
 def known(client: Client) -> set[str]:
-    """Actions the relay tells of."""
+    """Actions in the relay's list."""
     return set(client.call("/rosapi/action_servers")["values"]["action_servers"])
 
 
 def pursue(client: Client, action: str, **more: Any) -> list[dict[str, Any]]:
-    """Send a goal; all that comes of it."""
+    """Sends a goal; yields its messages."""
     client.send(op="send_action_goal", action=action, id="g", args={"order": 5}, **more)
     return until_the_end(client)
 
 
 def until_the_end(client: Client) -> list[dict[str, Any]]:
-    """All that comes of the goal ``g``, its result last."""
-    told = []
-    while not told or told[-1]["op"] != "action_result":
+    """Messages about the goal ``g``, its result last."""
+    reported = []
+    while not reported or reported[-1]["op"] != "action_result":
         message = client.receive()
         if message.get("id") == "g" and message["op"] != "status":
-            told.append(message)
-    return told
+            reported.append(message)
+    return reported
 
 
-# --- the robot pursues ------------------------------------------------------------------------------------
+# --- goals on the robot -----------------------------------------------------------------------------------
 
 
-def test_a_node_pursues_a_clients_goal(world: Any, peer: Peer) -> None:
-    """Feedback as it goes on, then one result; the type may be left to the graph."""
+def test_pipes_send_goals_and_carry_feedback_and_results(world: Any, peer: Peer) -> None:
+    owner, number = ("--owner", "operator"), ("--target-type", "std_msgs/msg/Int32")
+    pipes = {
+        "counted": ("rover:/counts{}", "rover:/counted", *number, "--field", "sequence[4]=data"),
+        "seen": (
+            "rover:/counts/_action/feedback",
+            "rover:/seen",
+            *number,
+            "--field",
+            "feedback.sequence[1]=data",
+        ),
+        "counts": ("rover:/odom", "rover:/counts{}", "--rate", "5", "--field", "header.stamp.sec=order*0+5"),
+    }
+    for name, settings in pipes.items():
+        world.relay.cli("pipe", "add", name, *settings, *owner)
+    with world.operating() as client:
+        for topic, value in (("/counted", 3), ("/seen", 1)):
+            client.send(op="subscribe", topic=topic, type="std_msgs/msg/Int32")
+            assert client.until(op="publish", topic=topic)["msg"]["data"] == value
+    for name in pipes:
+        assert world.relay.cli("pipe", "show", name)["state"] == "running"
+        world.relay.cli("pipe", "remove", name, "--yes")
+
+
+def test_a_node_executes_a_clients_goal(world: Any, peer: Peer) -> None:
+    """Feedback during the execution, then one result; the type may come from the graph."""
     with world.operating() as client:
         *feedback, end = pursue(client, "/counts", feedback=True)
         assert [each["values"]["sequence"] for each in feedback] == [
@@ -74,7 +98,7 @@ def test_a_node_pursues_a_clients_goal(world: Any, peer: Peer) -> None:
 
 
 def test_a_client_cancels_its_goal(world: Any, peer: Peer) -> None:
-    """The node ends it, and its result still comes."""
+    """The node ends it, and its result still arrives."""
     with world.operating() as client:
         client.send(op="send_action_goal", action="/endless", id="g", args=[3], feedback=True)
         client.until(op="action_feedback", id="g")
@@ -83,8 +107,8 @@ def test_a_client_cancels_its_goal(world: Any, peer: Peer) -> None:
         assert (end["status"], end["result"], end["values"]) == (5, True, {"sequence": [0, 1, 1]})
 
 
-def test_goals_that_come_to_nothing_are_told_so(world: Any, peer: Peer) -> None:
-    """Aborted, rejected, unknown, wrong, not allowed: one result each."""
+def test_failed_goals_are_reported(world: Any, peer: Peer) -> None:
+    """Aborted, rejected, unknown, invalid and denied goals: one result each."""
     with world.operating() as client, world.relay.connect("rover", world.viewer) as viewer:
         (aborted,) = pursue(client, "/aborts")
         assert aborted["status"] == 6
@@ -100,28 +124,28 @@ def test_goals_that_come_to_nothing_are_told_so(world: Any, peer: Peer) -> None:
         assert (refused["status"], refused["result"]) == (0, False)
 
 
-def test_a_client_that_vanishes_leaves_no_goal_behind(world: Any, peer: Peer) -> None:
-    """The node is told to cancel."""
-    ended = len(peer.told("ended", "/endless"))
+def test_a_client_that_disconnects_leaves_no_goal(world: Any, peer: Peer) -> None:
+    """The node is asked to cancel."""
+    ended = len(peer.reported("ended", "/endless"))
     with world.operating() as client:
         client.send(op="send_action_goal", action="/endless", id="g", args=[3], feedback=True)
         client.until(op="action_feedback", id="g")
-    peer.until(lambda: len(peer.told("ended", "/endless")) > ended)
-    assert peer.told("ended", "/endless")[-1]["canceled"] is True
+    peer.until(lambda: len(peer.reported("ended", "/endless")) > ended)
+    assert peer.reported("ended", "/endless")[-1]["canceled"] is True
 
 
 def test_a_right_that_is_taken_away_cancels_goals(world: Any, peer: Peer) -> None:
     """At once, for the node and for the client."""
     token = world.relay.user("counter")
     world.relay.cli("right", "grant", "counter", "rover", "operator")
-    ended = len(peer.told("ended", "/endless"))
+    ended = len(peer.reported("ended", "/endless"))
     with world.relay.connect("rover", token) as client:
         client.send(op="send_action_goal", action="/endless", id="g", args=[3], feedback=True)
         client.until(op="action_feedback", id="g")
         world.relay.cli("right", "grant", "counter", "rover", "viewer")
         end = until_the_end(client)[-1]
         assert (end["status"], end["result"]) == (5, False)
-    peer.until(lambda: len(peer.told("ended", "/endless")) > ended)
+    peer.until(lambda: len(peer.reported("ended", "/endless")) > ended)
 
 
 def test_every_kind_of_field_passes_in_goals(world: Any, tmp_path: Path) -> None:
@@ -142,10 +166,10 @@ def test_every_kind_of_field_passes_in_goals(world: Any, tmp_path: Path) -> None
             assert (message["last"], message["primitives"]["port"]) == (3, 9090)
 
 
-# --- clients pursue ---------------------------------------------------------------------------------------
+# --- goals on clients -------------------------------------------------------------------------------------
 
 
-def test_a_client_pursues_a_nodes_goal(world: Any, peer: Peer) -> None:
+def test_a_client_executes_a_nodes_goal(world: Any, peer: Peer) -> None:
     """With feedback and a result, as a node would."""
     with world.operating() as client:
         spelled = "example_interfaces/Fibonacci"
@@ -155,50 +179,50 @@ def test_a_client_pursues_a_nodes_goal(world: Any, peer: Peer) -> None:
         assert (goal["args"], goal["action_type"], goal["feedback"]) == ({"order": 7}, spelled, True)
         about = {"action": "/clients", "id": goal["id"]}
         client.send(op="action_feedback", **about, values={"sequence": [0, 1]})
-        peer.until(lambda: peer.told("feedback", "/clients"))
-        assert peer.told("feedback", "/clients")[0]["sequence"] == [0, 1]
+        peer.until(lambda: peer.reported("feedback", "/clients"))
+        assert peer.reported("feedback", "/clients")[0]["sequence"] == [0, 1]
         client.send(op="action_result", **about, values={"sequence": [0, 1, 1]}, result=True)
-        peer.until(lambda: peer.told("result", "/clients"))
-        end = peer.told("result", "/clients")[0]
+        peer.until(lambda: peer.reported("result", "/clients"))
+        end = peer.reported("result", "/clients")[0]
         assert (end["status"], end["sequence"]) == (4, [0, 1, 1])
 
 
 def test_a_node_cancels_a_goal_at_a_client(world: Any, peer: Peer) -> None:
-    """The client is asked to end it, and says how it ended."""
+    """The client is asked to end it, and reports how it ended."""
     with world.operating() as client:
         client.send(op="advertise_action", action="/stoppable", type=FIBONACCI)
         peer.do("send", "/stoppable", 7)
         goal = client.until(op="send_action_goal")
-        peer.until(lambda: peer.told("taken", "/stoppable"))
+        peer.until(lambda: peer.reported("taken", "/stoppable"))
         peer.do("cancel", "/stoppable")
         assert client.until(op="cancel_action_goal")["id"] == goal["id"]
         about = {"action": "/stoppable", "id": goal["id"]}
         client.send(op="action_result", **about, status=5, values={"sequence": [0]}, result=True)
-        peer.until(lambda: peer.told("result", "/stoppable"))
-        end = peer.told("result", "/stoppable")[0]
+        peer.until(lambda: peer.reported("result", "/stoppable"))
+        end = peer.reported("result", "/stoppable")[0]
         assert (end["status"], end["sequence"]) == (5, [0])
 
 
-def test_a_client_fails_or_vanishes_and_the_node_is_told(world: Any, peer: Peer) -> None:
-    """Its goals are aborted; so are those it answers with nonsense."""
+def test_the_node_is_notified_when_a_client_fails_or_disappears(world: Any, peer: Peer) -> None:
+    """Its goals are aborted; so are goals with invalid answers."""
     with world.operating() as client:
         client.send(op="advertise_action", action="/mortal", type=FIBONACCI)
         for order, said in ((1, {"result": False, "values": "no"}), (2, {"values": {"sum": 1}}), (3, None)):
             peer.do("send", "/mortal", order)
             goal = client.until(op="send_action_goal")
-            peer.until(lambda order=order: len(peer.told("taken", "/mortal")) == order)
+            peer.until(lambda order=order: len(peer.reported("taken", "/mortal")) == order)
             if said is None:
                 client.close()
             else:
                 client.send(op="action_result", action="/mortal", id=goal["id"], **said)
-            peer.until(lambda order=order: len(peer.told("result", "/mortal")) == order)
-    assert [(each["order"], each["status"]) for each in peer.told("result", "/mortal")] == [
+            peer.until(lambda order=order: len(peer.reported("result", "/mortal")) == order)
+    assert [(each["order"], each["status"]) for each in peer.reported("result", "/mortal")] == [
         (1, 6), (2, 6), (3, 6)
     ]  # fmt: skip
 
 
 def test_a_node_sends_every_kind_of_field_to_a_client(world: Any) -> None:
-    """And gets it back, unchanged."""
+    """It returns unchanged."""
     with world.operating() as client:
         client.send(op="advertise_action", action="/reflect", type=EVERYTHING)
         node = subprocess.Popen(
@@ -222,8 +246,8 @@ def test_a_node_sends_every_kind_of_field_to_a_client(world: Any) -> None:
         assert seen == {"status": 4, "same": True, "path": [0.25], "steps": [0, 1], "feedback_same": True}
 
 
-def test_a_client_pursues_a_clients_goal(world: Any) -> None:
-    """With feedback, cancelling and a result; and when it vanishes, an end in words."""
+def test_a_client_executes_a_clients_goal(world: Any) -> None:
+    """With feedback, cancelling and a result; if the server disconnects, the goal ends with a reason."""
     with world.operating() as server, world.operating() as asker:
         server.send(op="advertise_action", action="/shared", type=FIBONACCI)
         server.send(op="send_action_goal", action="/shared", id="own")
@@ -246,29 +270,29 @@ def test_a_client_pursues_a_clients_goal(world: Any) -> None:
         assert end["values"] == "the client that offered /shared has left"
 
 
-# --- clients that were not written for us -----------------------------------------------------------------
+# --- third-party clients ----------------------------------------------------------------------------------
 
 
 def offering(command: list[str], tmp_path: Path) -> Process:
-    """A client that says when it offers what it has to offer."""
+    """A client that prints when its offers are ready."""
     return Process(command, tmp_path, "client")
 
 
 def last_words(client: Process) -> dict[str, Any]:
-    """What a client saw, when it has ended well."""
+    """The results of a client, which must exit with 0."""
     assert client.popen.wait(120) == 0, client.log.read_text()[-2000:]
     return dict(json.loads(client.said().splitlines()[-1]))
 
 
-def test_roslibpy_offers_a_service_and_pursues_goals(world: Any, peer: Peer, tmp_path: Path) -> None:
+def test_roslibpy_offers_a_service_and_sends_goals(world: Any, peer: Peer, tmp_path: Path) -> None:
     """``Service.advertise``, ``ActionClient.send_goal`` and ``cancel_goal``."""
     script = [sys.executable, str(CLIENTS / "offering_with_roslibpy.py"), world.relay.url("rover")]
     client = offering([*script, world.operator, "/py_sum", "/counts", "/endless"], tmp_path)
     with running(client):
         client.wait_to_say("offered")
         peer.do("call", "/py_sum", 4, 5)
-        peer.until(lambda: peer.told("answer", "/py_sum"))
-        assert peer.told("answer", "/py_sum")[0]["sum"] == 9
+        peer.until(lambda: peer.reported("answer", "/py_sum"))
+        assert peer.reported("answer", "/py_sum")[0]["sum"] == 9
         seen = last_words(client)
     assert seen["request"] == {"a": 4, "b": 5}
     assert seen["result"] == {"status": 4, "values": {"sequence": [0, 1, 1, 2, 3]}}
@@ -276,7 +300,7 @@ def test_roslibpy_offers_a_service_and_pursues_goals(world: Any, peer: Peer, tmp
     assert seen["feedback"][:3] == [[0, 1, 1], [0, 1, 1, 2], [0, 1, 1, 2, 3]]
 
 
-def test_roslib_js_offers_a_service_and_an_action_and_pursues_goals(
+def test_roslib_js_offers_a_service_and_an_action_and_sends_goals(
     world: Any, peer: Peer, tmp_path: Path
 ) -> None:
     """``Service.advertise``, ``Action.advertise`` with cancelling, ``sendGoal`` and ``cancelGoal``."""
@@ -288,17 +312,17 @@ def test_roslib_js_offers_a_service_and_an_action_and_pursues_goals(
     with running(client):
         client.wait_to_say("offered")
         peer.do("call", "/js_sum", 4, 5)
-        peer.until(lambda: peer.told("answer", "/js_sum"))
-        assert peer.told("answer", "/js_sum")[0]["sum"] == 9
+        peer.until(lambda: peer.reported("answer", "/js_sum"))
+        assert peer.reported("answer", "/js_sum")[0]["sum"] == 9
         peer.do("send", "/js_counts", 6)
-        peer.until(lambda: peer.told("result", "/js_counts"))
-        assert peer.told("feedback", "/js_counts")[0]["sequence"] == [6]
+        peer.until(lambda: peer.reported("result", "/js_counts"))
+        assert peer.reported("feedback", "/js_counts")[0]["sequence"] == [6]
         peer.do("send", "/js_counts", 100)
-        peer.until(lambda: len(peer.told("taken", "/js_counts")) == 2)
+        peer.until(lambda: len(peer.reported("taken", "/js_counts")) == 2)
         peer.do("cancel", "/js_counts")
-        peer.until(lambda: len(peer.told("result", "/js_counts")) == 2)
+        peer.until(lambda: len(peer.reported("result", "/js_counts")) == 2)
         seen = last_words(client)
-    assert [(each["status"], each["sequence"]) for each in peer.told("result", "/js_counts")] == [
+    assert [(each["status"], each["sequence"]) for each in peer.reported("result", "/js_counts")] == [
         (4, [0, 1, 6]), (5, [0])
     ]  # fmt: skip
     assert seen["request"] == {"a": 4, "b": 5}

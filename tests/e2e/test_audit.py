@@ -1,4 +1,4 @@
-"""What people do with a robot is on record, whatever becomes of the database meanwhile."""
+"""Users' actions on a robot are audited, even if the database fails meanwhile."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ import pgserver
 import psutil
 import psycopg
 import pytest
-from switchboard_client import Client
-from switchboard_relay import Relay
-from switchboard_small_robot import SmallRobot
-from switchboard_waiting import wait_for
+
+from tests.worlds.relay_process import Relay
+from tests.worlds.small_robot import SmallRobot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 DONE = ["control.taken", "robot.stopped", "robot.resumed", "control.released"]
 """What :func:`acts` leaves, in this order."""
 
 
 class Breakdown:
-    """A relay whose database breaks down and comes back."""
+    """A relay whose database fails and recovers."""
 
     def __init__(self, folder: Path, database: str | None = None) -> None:
         self.relay = Relay(folder, database=database)
@@ -33,17 +34,16 @@ class Breakdown:
 
     @property
     def pid(self) -> int:
-        """Of the relay."""
+        """Process id of the relay."""
         assert self.relay.process is not None
         return self.relay.process.popen.pid
 
     @contextmanager
     def broken(self) -> Iterator[None]:
-        """Nothing can be written meanwhile."""
+        """No write succeeds in this block."""
         yield
 
     def end(self) -> None:
-        """End everything."""
         self.relay.stop()
 
 
@@ -63,7 +63,7 @@ class Locked(Breakdown):
 
 
 class Full(Breakdown):
-    """The database can't become any larger; the relay's log, which is smaller, can."""
+    """The database cannot grow; the relay's log, which is smaller, can."""
 
     @contextmanager
     def broken(self) -> Iterator[None]:
@@ -81,7 +81,8 @@ class Stopped(Breakdown):
     """The PostgreSQL server is not running."""
 
     def __init__(self, folder: Path) -> None:
-        # Not in pytest's folder, which other users can't enter: under root the server is another user's.
+        # Outside pytest's folder, which other users cannot enter: under root the server runs as another
+        # user.
         self._folder = Path(tempfile.mkdtemp(prefix="pg-of-audit-"))
         self._begin()
         with psycopg.connect(self._server.get_uri(), autocommit=True) as connection:
@@ -101,24 +102,21 @@ class Stopped(Breakdown):
             self._begin()
 
     def end(self) -> None:
-        """End everything."""
         super().end()
         self._server.cleanup()
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def acts(client: Client, robot: SmallRobot) -> None:
-    """Somebody takes control, stops the robot, lets it move again and gives control back."""
+    """A user takes control, stops the robot, resumes it and releases control."""
     for service in ("take_control", "stop", "resume", "release_control"):
         answer = client.call(f"/relay/{service}", {"why": "fire drill"})
         assert answer["values"]["success"], answer
 
 
 @pytest.mark.parametrize("kind", [Locked, Full, Stopped])
-def test_what_was_done_while_the_database_was_away_is_on_record(
-    kind: type[Breakdown], tmp_path: Path
-) -> None:
-    """In order, each with the time at which it happened, and the chain is whole; also what is done later."""
+def test_audit_entries_survive_an_absent_database(kind: type[Breakdown], tmp_path: Path) -> None:
+    """In order, each with its own time, with a valid chain; this includes later actions."""
     world = kind(tmp_path)
     robot: SmallRobot | None = None
     try:
@@ -146,8 +144,8 @@ def test_what_was_done_while_the_database_was_away_is_on_record(
         world.end()
 
 
-def test_what_waits_when_the_relay_stops_is_on_record_after_the_next_start(tmp_path: Path) -> None:
-    """The database is locked until the relay is gone."""
+def test_audit_entries_waiting_at_a_stop_are_written_at_the_next_start(tmp_path: Path) -> None:
+    """The database is locked until the relay has ended."""
     world = Locked(tmp_path)
     relay = world.relay
     robot = SmallRobot(relay, "rover", {}).comes()
@@ -168,7 +166,7 @@ def test_what_waits_when_the_relay_stops_is_on_record_after_the_next_start(tmp_p
 
 
 def entries(relay: Relay) -> list[dict[str, str | float]]:
-    """What the audit log has of control, the oldest first."""
+    """Entries of the audit log about control, oldest first."""
     found = relay.cli("audit", "list", "--limit", "1000")
     return [
         each for each in found if each["action"].startswith(("control.", "robot.stopped", "robot.resumed"))

@@ -1,4 +1,4 @@
-"""Settings that are wrong at the start: one sentence and an exit code, never a traceback."""
+"""Invalid settings at the start: one line and an exit code, never a traceback."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from switchboard_forks import run_command
-from switchboard_processes import BIN, ros_environment
 
-from relay_db.engine import Database
-from robot_client.link.identity import Enrolment, StateFolder
+from robot_client.link.enrolment import Enrolment, StateFolder
+from tests.worlds.empty_database import write_empty_database
+from tests.worlds.forked_programs import run_command
+from tests.worlds.processes import BIN, ros_environment
 
 SENTENCE = 400
 """Characters of a sentence, at most."""
 
 
-class Yard:
-    """Folders and files that are wrong in their ways; each is made when a test names it."""
+class World:
+    """Invalid folders and files; each is made when a test names it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def file(self, content: bytes = b"junk", name: str = "file") -> str:
-        """A file with this in it."""
+        """A file with this content."""
         path = self.folder / name
         path.write_bytes(content)
         return str(path)
 
     def data(self, name: str = "", content: bytes | None = None) -> str:
-        """A data folder in which one name stands for a folder, or for a file with this in it."""
+        """A data folder in which one name is a folder, or a file with this content."""
         path = self.folder / "data"
         path.mkdir()
         if name and content is None:
@@ -43,18 +43,16 @@ class Yard:
         return str(path)
 
     def database(self, statement: str) -> str:
-        """A data folder with a database in which something was done."""
+        """A data folder with a used database."""
         path = self.folder / "data" / "switchboard.db"
-        database = Database(f"sqlite:///{path}")
-        database.upgrade()
-        database.close()
+        write_empty_database(path)
         with sqlite3.connect(path) as connection:
             connection.execute(statement)
         connection.close()
         return str(path.parent)
 
     def state(self, name: str = "", content: bytes = b"", **changed: str) -> str:
-        """A robot's state folder, in which one file holds something else."""
+        """A robot's state folder with other content in one file."""
         path = self.folder / "state"
         enrolment = {"address": "127.0.0.1:1", "robot": "rover", "relay": "relay", **changed}
         StateFolder(path).prepare().commit(Enrolment(**enrolment, tls="server_name" in changed, ca=""))
@@ -64,24 +62,24 @@ class Yard:
 
 
 @pytest.fixture
-def yard(tmp_path: Path) -> Yard:
-    """Nothing there yet."""
-    return Yard(tmp_path)
+def world(tmp_path: Path) -> World:
+    """An empty world."""
+    return World(tmp_path)
 
 
 @pytest.fixture
 def taken() -> Iterator[str]:
-    """An address on which somebody listens."""
+    """An address that is in use."""
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         yield f"127.0.0.1:{other.getsockname()[1]}"
 
 
-def told(code: int, words: str, *command: str, read_only: str = "") -> None:
-    """The command ends by this code, and says one sentence with these words.
+def reported(code: int, words: str, *command: str, read_only: str = "") -> None:
+    """The command exits with this code and prints one line with these words.
 
-    :param read_only: a folder that it can't write; under root it has to give up what root may beyond its files' modes
+    :param read_only: a folder that it cannot write; under root it drops the privileges beyond file modes
     """
     if read_only:
         Path(read_only).chmod(0o500)
@@ -103,63 +101,68 @@ def told(code: int, words: str, *command: str, read_only: str = "") -> None:
 
 
 def shown(options: tuple[str, ...]) -> str:
-    """As the name of a test."""
+    """A test id for the command."""
     return " ".join(options)[:60].encode("unicode_escape").decode()
 
 
 # --- the relay --------------------------------------------------------------------------------------------
 
-Make = Callable[[Yard], str]
+Make = Callable[[World], str]
 
 DATA: list[tuple[str, int, str, Make]] = [
-    ("a file below which it would be", 3, "Not a directory", lambda yard: yard.file() + "/data"),
-    ("no database", 3, "no SQLite database", lambda yard: yard.data("switchboard.db", b"junk" * 1000)),
-    ("a folder for a database", 3, "database file can't be opened", lambda yard: yard.data("switchboard.db")),
+    ("a file below which it would be", 3, "Not a directory", lambda world: world.file() + "/data"),
+    ("no database", 3, "not an SQLite database", lambda world: world.data("switchboard.db", b"junk" * 1000)),
+    (
+        "a folder for a database",
+        3,
+        "database file can't be opened",
+        lambda world: world.data("switchboard.db"),
+    ),
     (
         "a newer version",
         3,
         "newer",
-        lambda yard: yard.database("UPDATE alembic_version SET version_num = '9999'"),
+        lambda world: world.database("UPDATE alembic_version SET version_num = '9999'"),
     ),
-    ("no tables", 3, "lacks tables", lambda yard: yard.database("DROP TABLE robot")),
-    ("a folder for a lock", 3, "Is a directory", lambda yard: yard.data("relay.lock")),
-    ("a folder for a name", 1, "name can't be read", lambda yard: yard.data("relay.name")),
-    ("bytes for a name", 1, "--name", lambda yard: yard.data("relay.name", b"\xff\xfe\n")),
-    ("a folder for a socket", 1, "can't be replaced", lambda yard: yard.data("relay.sock")),
-    ("a file for recordings", 1, "folder of recordings", lambda yard: yard.data("recordings", b"")),
+    ("no tables", 3, "lacks tables", lambda world: world.database("DROP TABLE robot")),
+    ("a folder for a lock", 3, "Is a directory", lambda world: world.data("relay.lock")),
+    ("a folder for a name", 1, "name can't be read", lambda world: world.data("relay.name")),
+    ("bytes for a name", 1, "--name", lambda world: world.data("relay.name", b"\xff\xfe\n")),
+    ("a folder for a socket", 1, "can't be replaced", lambda world: world.data("relay.sock")),
+    ("a file for recordings", 1, "folder of recordings", lambda world: world.data("recordings", b"")),
 ]
 
 
 @pytest.mark.parametrize(
     ("code", "words", "make"), [each[1:] for each in DATA], ids=[each[0] for each in DATA]
 )
-def test_data_folders(yard: Yard, code: int, words: str, make: Make) -> None:
-    """That can't be used."""
-    data = make(yard)
-    told(
+def test_data_folders(world: World, code: int, words: str, make: Make) -> None:
+    """Unusable ones."""
+    data = make(world)
+    reported(
         code, words, "switchboard", "serve", "--data", data, "--http", "127.0.0.1:0", "--robots", "127.0.0.1:0"
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("below", ["", "/data"])
-def test_read_only_data_folder(yard: Yard, below: str) -> None:
-    """Whether it is there already or would have to be made."""
-    folder = yard.data()
-    told(3, "Permission denied", "switchboard", "serve", "--data", folder + below, read_only=folder)
+def test_read_only_data_folder(world: World, below: str) -> None:
+    """Whether it exists or has to be made."""
+    folder = world.data()
+    reported(3, "Permission denied", "switchboard", "serve", "--data", folder + below, read_only=folder)
 
 
 URLS = {
     "postgresql://h:99999/x": (3, "can't be reached"),
-    "postgresql://h:abc/x": (1, "no database URL"),
-    "postgresql://[::1/x": (1, "no database URL"),
+    "postgresql://h:abc/x": (1, "not a database URL"),
+    "postgresql://[::1/x": (1, "not a database URL"),
     "postgresql://no.such.host.invalid/x": (3, "can't be reached"),
     "postgresql://127.0.0.1:1/x": (3, "can't be reached"),
     "postgresql://127.0.0.1:1/x?nonsense=1": (3, "'?'"),
     "postgresql://127.0.0.1:1/x?connect_timeout=abc": (3, "'?'"),
-    "postgresql+asyncpg://h/x": (1, "no database known here"),
-    "mysql://h/x": (1, "no database known here"),
-    "nonsense": (1, "no database URL"),
-    "sqlite://": (1, "give the database a file"),
+    "postgresql+asyncpg://h/x": (1, "is not supported"),
+    "mysql://h/x": (1, "is not supported"),
+    "nonsense": (1, "not a database URL"),
+    "sqlite://": (1, "the database URL needs a file"),
     "sqlite:////proc/x.db": (3, "database file"),
     "sqlite:////proc": (3, "database file"),
 }
@@ -169,26 +172,26 @@ URLS = {
     "command", [("user", "list"), ("serve", "--http", "127.0.0.1:0", "--robots", "127.0.0.1:0")]
 )
 @pytest.mark.parametrize("url", URLS)
-def test_database_urls(yard: Yard, url: str, command: tuple[str, ...]) -> None:
-    """Of each kind, for the relay and for a command beside it."""
+def test_database_urls(world: World, url: str, command: tuple[str, ...]) -> None:
+    """Of each kind, for the relay and for another command."""
     code, words = URLS[url]
-    told(code, words, "switchboard", "--data", str(yard.folder / "data"), "--db", url, *command)
+    reported(code, words, "switchboard", "--data", str(world.folder / "data"), "--db", url, *command)
 
 
-def test_folder_given_for_a_database_is_left_as_it_is(yard: Yard) -> None:
+def test_folder_given_for_a_database_is_left_as_it_is(world: World) -> None:
     """Others may still use it."""
-    folder = Path(yard.data())
+    folder = Path(world.data())
     folder.chmod(0o1777)
-    told(3, "database file", "switchboard", "--db", f"sqlite:///{folder}", "user", "list")
+    reported(3, "database file", "switchboard", "--db", f"sqlite:///{folder}", "user", "list")
     assert folder.stat().st_mode & 0o7777 == 0o1777
 
 
 OPTIONS = {
     ("--http", "127.0.0.1:99999"): "HOST:PORT",
     ("--http", "[::1"): "HOST:PORT",
-    ("--http", "203.0.113.9:0"): "can't listen on 203.0.113.9",
-    ("--http", "no.such.host.invalid:0"): "can't listen on no.such.host.invalid",
-    ("--robots", "a..b:0"): "can't listen on a..b",
+    ("--http", "203.0.113.9:0"): "cannot listen on 203.0.113.9",
+    ("--http", "no.such.host.invalid:0"): "cannot listen on no.such.host.invalid",
+    ("--robots", "a..b:0"): "cannot listen on a..b",
     ("--heartbeat", "nan"): "--heartbeat",
     ("--heartbeat", "inf"): "--heartbeat",
     ("--recordings-gb", "nan"): "--recordings-gb",
@@ -211,31 +214,40 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=shown)
-def test_options_of_the_relay(yard: Yard, options: tuple[str, ...]) -> None:
-    """With the option or the value in the sentence."""
+def test_options_of_the_relay(world: World, options: tuple[str, ...]) -> None:
+    """The error names the option or the value."""
     addresses = {"--http": "127.0.0.1:0", "--robots": "127.0.0.1:0"}
     free = [word for name, value in addresses.items() if name not in options for word in (name, value)]
-    data = str(yard.folder / "data")
+    data = str(world.folder / "data")
     code = 2 if OPTIONS[options] == "/proc" else 1
-    told(code, OPTIONS[options], "switchboard", "serve", "--data", data, *free, *options)
+    reported(code, OPTIONS[options], "switchboard", "serve", "--data", data, *free, *options)
 
 
 @pytest.mark.parametrize("which", ["--http", "--robots"])
-def test_ports_in_use(yard: Yard, taken: str, which: str) -> None:
+def test_ports_in_use(world: World, taken: str, which: str) -> None:
     """With address and port."""
     options = {"--http": "127.0.0.1:0", "--robots": "127.0.0.1:0", which: taken}
-    words = f"can't listen on 127.0.0.1 port {taken.partition(':')[2]}: Address already in use"
-    data = str(yard.folder / "data")
-    told(
+    words = f"cannot listen on 127.0.0.1 port {taken.partition(':')[2]}: Address already in use"
+    data = str(world.folder / "data")
+    reported(
         1, words, "switchboard", "serve", "--data", data, *(word for each in options.items() for word in each)
     )
 
 
-def test_certificate_that_is_none(yard: Yard) -> None:
-    """Any bytes."""
-    file = yard.file(b"\xff\xfe")
-    told(
-        1, "certificate", "switchboard", "serve", "--data", yard.data(), "--tls-cert", file, "--tls-key", file
+def test_invalid_certificate(world: World) -> None:
+    """The file has random bytes."""
+    file = world.file(b"\xff\xfe")
+    reported(
+        1,
+        "certificate",
+        "switchboard",
+        "serve",
+        "--data",
+        world.data(),
+        "--tls-cert",
+        file,
+        "--tls-key",
+        file,
     )
 
 
@@ -245,7 +257,7 @@ ENROLMENTS = {
     ("--relay", "no.such.host.invalid:9"): "can't be resolved",
     ("--relay", "127.0.0.1:99999"): "host:port",
     ("--relay", "http://127.0.0.1:1"): "host:port",
-    ("--relay", "127.0.0.1:1"): "nobody listens",
+    ("--relay", "127.0.0.1:1"): "refuses connections",
     ("--relay", "127.0.0.1:1", "--ca", "/nope"): "/nope",
     ("--relay", "127.0.0.1:1", "--tls", "--server-name", "a..b"): "--server-name",
     ("--relay", "127.0.0.1:1", "--state", "/proc/x"): "can't be written",
@@ -254,34 +266,34 @@ ENROLMENTS = {
 
 
 @pytest.mark.parametrize("options", ENROLMENTS, ids=shown)
-def test_enrolments(yard: Yard, options: tuple[str, ...]) -> None:
-    """The state folder is left as it was."""
-    state = yard.folder / "state"
+def test_enrolments(world: World, options: tuple[str, ...]) -> None:
+    """The state folder is unchanged."""
+    state = world.folder / "state"
     usual = {"--state": str(state), "--robot": "rover", "--code": "abc"}
     words = [word for name, value in usual.items() if name not in options for word in (name, value)]
-    told(1, ENROLMENTS[options], "switchboard-robot", "enroll", *words, *options)
+    reported(1, ENROLMENTS[options], "switchboard-robot", "enroll", *words, *options)
     assert not state.exists()
 
 
-def test_read_only_state_folder(yard: Yard) -> None:
-    """Said before the code is spent."""
-    state = yard.data()
+def test_read_only_state_folder(world: World) -> None:
+    """The error comes before the code is spent."""
+    state = world.data()
     enrolling = "--relay", "127.0.0.1:1", "--robot", "rover", "--code", "abc", "--state", state + "/rover"
-    told(1, "Permission denied", "switchboard-robot", "enroll", *enrolling, read_only=state)
+    reported(1, "Permission denied", "switchboard-robot", "enroll", *enrolling, read_only=state)
 
 
 STATES: list[tuple[str, Make]] = [
-    ("is damaged", lambda yard: yard.state("robot.json", b"{")),
-    ("is damaged", lambda yard: yard.state("robot.json", b'{"address":"\xff"}')),
-    ("is damaged", lambda yard: yard.state("robot.key", b"x")),
-    ("no robot is enrolled", lambda yard: str(yard.folder / "none")),
+    ("is damaged", lambda world: world.state("robot.json", b"{")),
+    ("is damaged", lambda world: world.state("robot.json", b'{"address":"\xff"}')),
+    ("is damaged", lambda world: world.state("robot.key", b"x")),
+    ("no robot is enrolled", lambda world: str(world.folder / "none")),
 ]
 
 
 @pytest.mark.parametrize(("words", "make"), STATES)
-def test_states_of_a_robot(yard: Yard, words: str, make: Make) -> None:
-    """That can't be used."""
-    told(1, words, "switchboard-robot", "run", "--state", make(yard))
+def test_states_of_a_robot(world: World, words: str, make: Make) -> None:
+    """Unusable ones."""
+    reported(1, words, "switchboard-robot", "run", "--state", make(world))
 
 
 CONFIGS = {
@@ -292,15 +304,15 @@ CONFIGS = {
     b"[cameras]\n'/c' = 5": "cameras",
     b"[ros]\nnode = 'a b'": "node",
     b"[video]\nstreams = -1": "streams",
-    b"[video]\ntarget_ms = nan": "target_ms",
+    b"[video]\ntarget_delay_ms = nan": "target_delay_ms",
 }
 
 
 @pytest.mark.parametrize("content", CONFIGS)
-def test_settings_of_a_robot(yard: Yard, content: bytes) -> None:
-    """With the key in the sentence."""
-    file = yard.file(content, "robot.toml")
-    told(1, CONFIGS[content], "switchboard-robot", "run", "--state", yard.state(), "--config", file)
+def test_settings_of_a_robot(world: World, content: bytes) -> None:
+    """The error names the key."""
+    file = world.file(content, "robot.toml")
+    reported(1, CONFIGS[content], "switchboard-robot", "run", "--state", world.state(), "--config", file)
 
 
 PROGRAMS = {
@@ -327,5 +339,5 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("command", PROGRAMS, ids=" ".join)
 def test_other_programs(command: tuple[str, ...]) -> None:
-    """Of a robot."""
-    told(*PROGRAMS[command], *command)
+    """Programs of a robot."""
+    reported(*PROGRAMS[command], *command)

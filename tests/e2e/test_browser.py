@@ -1,4 +1,4 @@
-"""The portal in a real browser, with the real relay and a real (simulated) robot behind it."""
+"""The portal in a real browser, with a real relay and a simulated robot."""
 
 from __future__ import annotations
 
@@ -10,23 +10,26 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from playwright.sync_api import Browser, Page, expect
-from switchboard_browser import (
+
+from robot_client.motion.watchdog import STOP_ZEROS
+from tests.worlds.browser import (
+    SMALL_CAMERA,
+    checked_pages,
     hold_joystick,
     hold_resume,
-    lived_in,
+    open_session,
+    open_topic,
     picture,
     ready_to_drive,
+    running_world,
     seen,
-    sound_pages,
 )
-from switchboard_drive import LET_GO_SECONDS
-from switchboard_pulse import Pulse
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_video import get
-from switchboard_waiting import wait_for
-
-from robot_client.motion.safety import REPEATS
+from tests.worlds.driving import LET_GO_SECONDS
+from tests.worlds.machine_pauses import Pulse
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.video_clients import get
+from tests.worlds.waiting import wait_for
 
 PASSWORD = "correct horse"
 WAIT_SECONDS = 60.0
@@ -34,12 +37,12 @@ WAIT_SECONDS = 60.0
 OpenPage = Callable[..., Page]
 
 
-class House:
+class World:
     """A relay, a robot with its camera on, a pilot and a watcher."""
 
     def __init__(self, folder: Path) -> None:
         self.relay = Relay(folder)
-        self.robot = Robot(self.relay, "rover", camera=True)
+        self.robot = Robot(self.relay, "rover", camera=True, sim_options=SMALL_CAMERA)
         self.pilot = self.relay.user("pilot")
         self.relay.user("watcher")
         self.relay.cli("right", "grant", "pilot", "rover", "operator")
@@ -47,58 +50,55 @@ class House:
 
     @property
     def url(self) -> str:
-        """Where the portal is."""
+        """The URL of the portal."""
         return f"http://127.0.0.1:{self.relay.http_port}"
 
     def put_back(self) -> None:
-        """The robot stands where it began."""
+        """The robot stands at its start."""
         with self.relay.connect("rover", self.pilot) as client:
             wait_for("the robot is put back", lambda: client.call("/reset")["result"])
 
     def stop(self) -> None:
-        """End everything."""
         self.robot.stop()
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """One house for all; the tests that restart its relay leave it whole."""
-    yield from lived_in(House, tmp_path_factory.mktemp("browser"))
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """One world for all tests; a test that restarts the relay leaves it running."""
+    yield from running_world(World, tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture
-def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
-    """Opens pages of the portal; an uncaught error or a breach of the CSP in any of them fails the test."""
-    with sound_pages(browser, house.url, WAIT_SECONDS) as new_page:
+def open_page(browser: Browser, world: World) -> Iterator[OpenPage]:
+    """Opens pages of the portal; an uncaught error or a violation of the CSP in any of them fails the test."""
+    with checked_pages(browser, world.url, WAIT_SECONDS) as new_page:
 
         def open_page(path: str = "/", user: str = "", width: int = 1280, height: int = 800) -> Page:
             page = new_page(width, height)
-            page.goto("/login" if user else path)
             if user:
-                log_in(page, user)
-                expect(seen(page, "robot-card")).to_have_count(1)
-                page.goto(path)
+                open_session(page, user, PASSWORD)
+            page.goto(path)
             return page
 
         yield open_page
 
 
 def log_in(page: Page, user: str) -> None:
-    """Fill in the form."""
+    """Submits the login form."""
     seen(page, "login-user").fill(user)
     seen(page, "login-password").fill(PASSWORD)
     seen(page, "login-submit").click()
 
 
 def ready(page: Page) -> None:
-    """The cockpit is connected, has control, and its picture is live."""
+    """Waits until the cockpit is connected, has control, and shows live video."""
     ready_to_drive(page)
     expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
 
 
 def colours(page: Page, canvas: str) -> int:
-    """How many different colours a canvas shows, of those at every 16th pixel."""
+    """The number of colours on a canvas, at every 16th pixel."""
     return int(
         seen(page, canvas).evaluate(
             """canvas => {
@@ -111,38 +111,39 @@ def colours(page: Page, canvas: str) -> int:
     )
 
 
-def stands_after_zero(house: House, page: Page, since: int) -> None:
-    """What reached the robot since then ends with zeros alone, and it stands.
+def stands_after_zero(world: World, page: Page, since: int) -> None:
+    """Waits until the last commands to the robot are zeros, and it stands.
 
-    The page says zero once; the robot's daemon repeats it for 200 ms, for subscribers that may have missed it. A page
-    that was late, as on a busy computer, has had the robot stopped by its watchdog already, in the same way.
+    The page sends zero once; the robot's daemon repeats it for 200 ms, for subscribers that may have missed
+    it. On a busy computer the page may be late, so that the watchdog has stopped the robot already in the
+    same way.
     """
 
     def commands() -> list[tuple[float, float]]:
-        return [(each["v"], each["w"]) for each in house.robot.events("command", since)]
+        return [(each["v"], each["w"]) for each in world.robot.events("command", since)]
 
     wait_for("a zero came", lambda: commands()[-1:] == [(0, 0)])
-    wait_for("the robot stands", lambda: not house.robot.moving())
-    page.wait_for_timeout(700)  # proves absence: no further command, and no zero but the daemon's repeats
-    told = commands()
-    last = max(index for index, each in enumerate(told) if each != (0, 0))
-    assert 1 <= len(told[last + 1 :]) <= 2 * REPEATS
+    wait_for("the robot stands", lambda: not world.robot.moving())
+    page.wait_for_timeout(700)  # shows absence: no further command, and no zero but the daemon's repeats
+    reported = commands()
+    last = max(index for index, each in enumerate(reported) if each != (0, 0))
+    assert 1 <= len(reported[last + 1 :]) <= 2 * STOP_ZEROS
 
 
-def turn_by_key(house: House, page: Page) -> None:
-    """Holding A turns the robot on the spot; lifting it brings zero and standstill."""
+def turn_by_key(world: World, page: Page) -> None:
+    """Holding A turns the robot; releasing it sends zero and the robot stands."""
     since = time.monotonic_ns()
     page.keyboard.down("a")
-    wait_for("the robot moves", house.robot.moving)
+    wait_for("the robot moves", world.robot.moving)
     page.keyboard.up("a")
-    stands_after_zero(house, page, since)
+    stands_after_zero(world, page, since)
 
 
-# --- coming in --------------------------------------------------------------------------------------------
+# --- login ------------------------------------------------------------------------------------------------
 
 
-def test_a_password_leads_to_the_robots_and_into_the_cockpit(house: House, open_page: OpenPage) -> None:
-    """Log in, see the robot online, open it: picture, scan, odometry, latency and topics are live."""
+def test_a_password_leads_to_the_robots_and_into_the_cockpit(world: World, open_page: OpenPage) -> None:
+    """Log in, see the robot online, open it: video, scan, odometry, latency and topics are live."""
     page = open_page("/")
     log_in(page, "pilot")
     card = page.locator("[data-testid=robot-card][data-robot=rover]")
@@ -151,8 +152,7 @@ def test_a_password_leads_to_the_robots_and_into_the_cockpit(house: House, open_
     ready(page)
     expect(seen(page, "latency-badge")).to_contain_text(re.compile(r"\d+ ms"))
     expect(seen(page, "odom-x")).to_have_text(re.compile(r"-?−?\d+\.\d\d"))
-    row = page.locator("[data-testid=topic-row][data-topic='/battery_state']")
-    row.click()
+    open_topic(page, "/battery_state")
     expect(seen(page, "topic-echo")).to_contain_text("percentage")
     assert colours(page, "camera-canvas") > 50
     first = picture(page, "camera-canvas")
@@ -160,7 +160,7 @@ def test_a_password_leads_to_the_robots_and_into_the_cockpit(house: House, open_
 
 
 def test_a_one_time_link_logs_in_once(browser: Browser, tmp_path: Path) -> None:
-    """The link of a relay's first start opens the portal as administrator; used again it says so."""
+    """The link of a relay's first start opens the portal as administrator; a second use shows an error."""
     relay = Relay(tmp_path)
     try:
         assert relay.process is not None
@@ -181,7 +181,7 @@ def test_a_one_time_link_logs_in_once(browser: Browser, tmp_path: Path) -> None:
 
 
 def test_logging_out_closes_the_portal(open_page: OpenPage) -> None:
-    """After logging out only the login is left, also for an address typed by hand."""
+    """Only the login page is left, for typed addresses too."""
     page = open_page("/fleet", "pilot")
     seen(page, "user-menu").click()
     seen(page, "logout").click()
@@ -193,75 +193,74 @@ def test_logging_out_closes_the_portal(open_page: OpenPage) -> None:
 # --- driving ----------------------------------------------------------------------------------------------
 
 
-def test_the_joystick_drives_and_letting_go_stops(house: House, open_page: OpenPage) -> None:
-    """The robot moves by its own record, picture and scan change; letting go brings zero and standstill."""
-    house.put_back()
+def test_the_joystick_drives_and_releasing_stops(world: World, open_page: OpenPage) -> None:
+    """The robot moves by its own log, video and scan change; releasing sends zero and the robot stands."""
+    world.put_back()
     page = open_page("/cockpit/rover", "pilot")
     ready(page)
     before = {name: picture(page, name) for name in ("scan-canvas", "camera-canvas")}
     since = time.monotonic_ns()
     hold_joystick(page, -60, -30)
-    wait_for("the robot moves", house.robot.moving)
+    wait_for("the robot moves", world.robot.moving)
     expect(seen(page, "odom-speed")).not_to_have_text("0.00")
     for name, shown in before.items():
         wait_for(f"{name} changes", lambda name=name, shown=shown: picture(page, name) != shown)
     page.mouse.up()
-    stands_after_zero(house, page, since)
-    turning = [each for each in house.robot.events("command", since) if each["w"]]
+    stands_after_zero(world, page, since)
+    turning = [each for each in world.robot.events("command", since) if each["w"]]
     assert all(each["w"] > 0 for each in turning), "pulled to the left it turns left"
     expect(seen(page, "odom-speed")).to_have_text("0.00")
 
 
-def test_the_keyboard_drives_and_lifting_the_key_stops(house: House, open_page: OpenPage) -> None:
-    """A turns on the spot; lifting it brings zero and standstill."""
+def test_the_keyboard_drives_and_lifting_the_key_stops(world: World, open_page: OpenPage) -> None:
+    """A turns in place; releasing it sends zero and the robot stands."""
     page = open_page("/cockpit/rover", "pilot")
     ready(page)
-    turn_by_key(house, page)
+    turn_by_key(world, page)
 
 
-def test_a_page_that_loses_the_focus_stops(house: House, open_page: OpenPage) -> None:
-    """Blur while driving stops the robot, though the key is still held."""
+def test_a_page_that_loses_the_focus_stops(world: World, open_page: OpenPage) -> None:
+    """Losing the focus stops the robot, though the key is still held."""
     page = open_page("/cockpit/rover", "pilot")
     ready(page)
     since = time.monotonic_ns()
     page.keyboard.down("a")
-    wait_for("the robot moves", house.robot.moving)
+    wait_for("the robot moves", world.robot.moving)
     page.evaluate("window.dispatchEvent(new Event('blur'))")
-    stands_after_zero(house, page, since)
+    stands_after_zero(world, page, since)
     page.keyboard.up("a")
 
 
-def test_a_page_that_is_closed_leaves_the_robot_standing(house: House, open_page: OpenPage) -> None:
-    """Closing the tab while driving stops the robot."""
+def test_a_page_that_is_closed_leaves_the_robot_standing(world: World, open_page: OpenPage) -> None:
     page = open_page("/cockpit/rover", "pilot")
     ready(page)
     page.keyboard.down("a")
-    wait_for("the robot moves", house.robot.moving)
+    wait_for("the robot moves", world.robot.moving)
     page.close()
-    wait_for("the robot stands", lambda: not house.robot.moving())
+    wait_for("the robot stands", lambda: not world.robot.moving())
 
 
-def test_the_stop_button_stops(house: House, open_page: OpenPage) -> None:
-    """STOP beats the key that is held, and lasts until somebody holds the button to resume."""
+def test_the_stop_button_stops(world: World, open_page: OpenPage) -> None:
+    """STOP overrides the held key, and lasts until a user holds the resume button."""
     page = open_page("/cockpit/rover", "pilot")
     ready(page)
     page.keyboard.down("a")
-    wait_for("the robot moves", house.robot.moving)
+    wait_for("the robot moves", world.robot.moving)
     seen(page, "stop").click()
-    wait_for("the robot stands", lambda: not house.robot.moving())
+    wait_for("the robot stands", lambda: not world.robot.moving())
     page.keyboard.up("a")
     expect(seen(page, "stopped")).to_contain_text("By pilot")
     hold_resume(page)
-    turn_by_key(house, page)
+    turn_by_key(world, page)
 
 
 # --- rights -----------------------------------------------------------------------------------------------
 
 
 def test_a_viewer_watches_and_sees_why_there_is_nothing_to_drive_with(
-    house: House, open_page: OpenPage
+    world: World, open_page: OpenPage
 ) -> None:
-    """The picture is live, the controls are off and say why; nothing reaches the robot."""
+    """The video is live, and the controls are disabled with a reason; no command reaches the robot."""
     page = open_page("/cockpit/rover", "watcher")
     expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
     expect(seen(page, "drive-blocked")).to_contain_text("viewer")
@@ -270,17 +269,17 @@ def test_a_viewer_watches_and_sees_why_there_is_nothing_to_drive_with(
     hold_joystick(page, 0, -60)
     page.mouse.up()
     page.keyboard.press("w")
-    page.wait_for_timeout(500)  # proves absence
-    assert house.robot.events("command", since) == []
+    page.wait_for_timeout(500)  # shows absence
+    assert world.robot.events("command", since) == []
 
 
-def test_a_revoked_right_is_said_within_two_seconds(house: House, open_page: OpenPage) -> None:
-    """The admin command line revokes; the open cockpit shows it in words, and a new right opens it again."""
-    house.relay.user("leaver")
-    house.relay.cli("right", "grant", "leaver", "rover", "operator")
+def test_a_revoked_right_is_shown_within_two_seconds(world: World, open_page: OpenPage) -> None:
+    """The command line revokes the right; the open cockpit shows the reason, and a new right opens it again."""
+    world.relay.user("leaver")
+    world.relay.cli("right", "grant", "leaver", "rover", "operator")
     page = open_page("/cockpit/rover", "leaver")
     ready(page)
-    house.relay.cli("right", "revoke", "leaver", "rover")
+    world.relay.cli("right", "revoke", "leaver", "rover")
     with Pulse() as pulse:
         begun = time.monotonic()
         expect(seen(page, "link-banner")).to_contain_text("revoked")
@@ -288,37 +287,37 @@ def test_a_revoked_right_is_said_within_two_seconds(house: House, open_page: Ope
     expect(seen(page, "link-state")).to_have_attribute("data-state", "closed")
 
 
-# --- what breaks ------------------------------------------------------------------------------------------
+# --- failures ---------------------------------------------------------------------------------------------
 
 
-def test_the_page_recovers_from_a_restart_of_the_relay(house: House, open_page: OpenPage) -> None:
-    """Stopped, killed: each time the open cockpit is live again by itself, still logged in."""
+def test_the_page_recovers_from_a_restart_of_the_relay(world: World, open_page: OpenPage) -> None:
+    """After a stop and after a kill the open cockpit is live again by itself, still logged in."""
     page = open_page("/cockpit/rover", "pilot")
     ready(page)
-    for end in (house.relay.stop, house.relay.kill):
+    for end in (world.relay.stop, world.relay.kill):
         end()
         expect(seen(page, "link-state")).not_to_have_attribute("data-state", "open")
-        house.relay.start()
-        house.robot.wait_online()
+        world.relay.start()
+        world.robot.wait_online()
         ready(page)
         first = picture(page, "camera-canvas")
         wait_for("the picture changes", lambda first=first: picture(page, "camera-canvas") != first)
-    # Whoever has driven this robot by the relay that was killed lets go of it first.
+    # A client that drove before the kill must release first.
     page.keyboard.press("a", delay=200)
-    page.wait_for_timeout(1000 * LET_GO_SECONDS)  # so long he must say nothing
-    turn_by_key(house, page)
+    page.wait_for_timeout(1000 * LET_GO_SECONDS)  # a pause this long counts as a release
+    turn_by_key(world, page)
 
 
-def test_a_robot_that_goes_away_is_shown_so_and_comes_back(house: House, open_page: OpenPage) -> None:
-    """Fleet and cockpit tell that the robot is offline, and both are live again when it is back."""
+def test_a_robot_that_goes_away_is_shown_so_and_comes_back(world: World, open_page: OpenPage) -> None:
+    """Fleet and cockpit show the robot offline, and both are live again when it is back."""
     fleet = open_page("/fleet", "watcher")
     page = open_page("/cockpit/rover", "pilot")
     ready(page)
     state = fleet.locator("[data-robot=rover]").get_by_test_id("robot-state")
-    house.robot.daemon.stop()
+    world.robot.daemon.stop()
     expect(state).to_have_attribute("data-state", "offline")
     expect(seen(page, "drive-blocked")).to_have_text("The robot is offline.")
-    house.robot.start_daemon()
+    world.robot.start_daemon()
     expect(state).not_to_have_attribute("data-state", "offline")
     ready(page)
 
@@ -326,10 +325,12 @@ def test_a_robot_that_goes_away_is_shown_so_and_comes_back(house: House, open_pa
 # --- recording --------------------------------------------------------------------------------------------
 
 
-def test_what_is_recorded_from_the_cockpit_is_downloaded_there(
-    house: House, open_page: OpenPage, tmp_path: Path
+def test_recording_from_the_cockpit_is_downloaded_there(
+    world: World, open_page: OpenPage, tmp_path: Path
 ) -> None:
-    """Chosen by hand, followed, stopped, and read by MCAP's own library; who only watches sees nothing of it."""
+    """Topics are selected by hand, and the recording is watched, stopped, and read by MCAP's own library. A
+    viewer does not see it.
+    """
     page = open_page("/cockpit/rover", "pilot")
     seen(page, "recording-new").click()
     page.locator("[data-testid=recording-topic][data-topic='/odom']").check()
@@ -337,8 +338,8 @@ def test_what_is_recorded_from_the_cockpit_is_downloaded_there(
     seen(page, "recording-start").click()
     expect(seen(page, "recording-state")).to_have_text("Recording")
     expect(seen(page, "recording-messages")).to_have_text(re.compile(r"[1-9]\d+"))
-    # Its first picture goes to all who watch it.
-    assert get(house.relay, house.pilot, "snapshot").status == 200
+    # Its first frame is sent to all viewers.
+    assert get(world.relay, world.pilot, "snapshot").status == 200
     watcher = open_page("/cockpit/rover", "watcher")
     expect(seen(watcher, "topic-row").first).to_be_visible()
     expect(seen(watcher, "recordings")).to_have_count(0)
@@ -354,15 +355,15 @@ def test_what_is_recorded_from_the_cockpit_is_downloaded_there(
     seen(page, "recording-delete").click()
     seen(page, "recording-delete-sure").click()
     expect(seen(page, "recording")).to_have_count(0)
-    assert list((house.relay.data / "recordings").iterdir()) == []
+    assert list((world.relay.data / "recordings").iterdir()) == []
 
 
-# --- looks ------------------------------------------------------------------------------------------------
+# --- layout -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])
 def test_no_page_scrolls_sideways(open_page: OpenPage, tmp_path: Path, width: int, height: int) -> None:
-    """Login, fleet and cockpit fit a phone and a laptop; their pictures are kept for people to look at."""
+    """Login, fleet and cockpit fit a phone and a laptop; screenshots are kept for review."""
     shots = {}
     page = open_page("/login", width=width, height=height)
     expect(seen(page, "login-submit")).to_be_visible()
@@ -372,7 +373,7 @@ def test_no_page_scrolls_sideways(open_page: OpenPage, tmp_path: Path, width: in
     shots["fleet"] = page
     page = open_page("/cockpit/rover", "pilot", width, height)
     ready(page)
-    page.locator("[data-testid=topic-row][data-topic='/scan']").click()
+    open_topic(page, "/scan")
     expect(seen(page, "topic-echo")).to_contain_text("angle_min")
     shots["cockpit"] = page
     for name, each in shots.items():

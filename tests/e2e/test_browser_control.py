@@ -1,4 +1,4 @@
-"""Who drives, with two people and more at once: real browsers, the real relay, a simulated robot."""
+"""Control with two users and more: real browsers, a real relay, a simulated robot."""
 
 from __future__ import annotations
 
@@ -8,66 +8,71 @@ from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Page, WebSocketRoute, expect
-from switchboard_browser import (
+
+from tests.worlds.browser import (
     hold_joystick,
     hold_resume,
-    lived_in,
     ready_to_drive,
+    running_world,
     seen,
     stands,
     take_control,
-    was_told,
+    was_notified,
 )
-from switchboard_household import COCKPIT, Household, OpenPage, pages_of
-from switchboard_waiting import wait_for
+from tests.worlds.portal_relay import COCKPIT, OpenPage, PortalWorld, pages_of
+from tests.worlds.waiting import wait_for
 
 GRACE_SECONDS = 2.0
 USERS = {"ann": "operator", "bob": "operator", "olga": "owner", "vera": "viewer"}
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Household]:
-    """One house for all; each test leaves the robot free, and able to move."""
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PortalWorld]:
+    """One world for all; each test leaves the robot without a controller and not stopped."""
     grace = ("--control-grace", str(GRACE_SECONDS))
-    yield from lived_in(lambda folder: Household(folder, USERS, *grace), tmp_path_factory.mktemp("control"))
+    yield from running_world(
+        lambda folder: PortalWorld(folder, USERS, *grace), tmp_path_factory.mktemp("control")
+    )
 
 
 @pytest.fixture
-def open_page(browser: Browser, house: Household) -> Iterator[OpenPage]:
-    """Opens pages of the portal for a user; an uncaught error or a breach of the CSP in any of them fails the test."""
-    with pages_of(browser, house) as open_page:
+def open_page(browser: Browser, world: PortalWorld) -> Iterator[OpenPage]:
+    """Opens pages of the portal for a user; an uncaught error or a violation of the CSP in any of them fails
+    the test.
+    """
+    with pages_of(browser, world) as open_page:
         yield open_page
 
 
 def ask(page: Page, why: str = "") -> None:
-    """Ask who has control for it."""
+    """Requests control from the controller."""
     seen(page, "control-ask").click()
     seen(page, "control-why").fill(why)
     seen(page, "control-ask-send").click()
     stands(page, "waiting")
 
 
-def drive(house: Household, page: Page) -> int:
-    """Hold a key until the robot turns; the moment before."""
+def drive(world: PortalWorld, page: Page) -> int:
+    """Holds a key until the robot turns; returns the time before."""
     since = time.monotonic_ns()
     page.keyboard.down("a")
-    house.moves()
+    world.moves()
     return since
 
 
 def stop_by(page: Page) -> None:
-    """Press STOP; it is done when the robot has confirmed it."""
-    with page.expect_response(re.compile("/robots/rover/stop$")) as told:
+    """Presses STOP and waits for the robot's confirmation."""
+    with page.expect_response(re.compile("/robots/rover/stop$")) as reported:
         seen(page, "stop").click()
-    assert told.value.ok
+    assert reported.value.ok
     expect(seen(page, "stopped")).to_contain_text("The robot is stopped.")
 
 
 # --- handing over -----------------------------------------------------------------------------------------
 
 
-def test_control_is_taken_asked_for_and_granted(house: Household, open_page: OpenPage) -> None:
-    """One drives, the other can't; asked and granted it is the other way round, by the robot's own record."""
+def test_control_is_taken_asked_for_and_granted(world: PortalWorld, open_page: OpenPage) -> None:
+    """One user drives, the other cannot; after a granted request it is the reverse, by the robot's own log."""
     ann, bob = open_page("ann"), open_page("bob")
     stands(bob, "free")
     take_control(ann)
@@ -75,59 +80,61 @@ def test_control_is_taken_asked_for_and_granted(house: Household, open_page: Ope
     expect(seen(bob, "control-words")).to_have_text("ann has control.")
     since = time.monotonic_ns()
     bob.keyboard.press("a")
-    bob.wait_for_timeout(500)  # proves absence
-    assert house.movements(since) == []
-    drive(house, ann)
+    bob.wait_for_timeout(500)  # shows absence
+    assert world.movements(since) == []
+    drive(world, ann)
 
     ask(bob, "to the charger, please")
-    expect(seen(ann, "control-request")).to_contain_text("bob asks for control. “to the charger, please”")
+    expect(seen(ann, "control-request")).to_contain_text("bob requests control. “to the charger, please”")
     seen(ann, "control-grant").click()
     stands(bob, "yours")
     stands(ann, "held")
-    house.stands()
+    world.stands()
     ann.keyboard.up("a")
     since = time.monotonic_ns()
     ann.keyboard.press("a")
-    ann.wait_for_timeout(500)  # proves absence
-    assert house.movements(since) == []
-    drive(house, bob)
+    ann.wait_for_timeout(500)  # shows absence
+    assert world.movements(since) == []
+    drive(world, bob)
     bob.keyboard.up("a")
-    house.stands()
+    world.stands()
 
 
-def test_a_refused_request_leaves_everything_as_it_was(house: Household, open_page: OpenPage) -> None:
-    """The holder goes on, and who asked is told so."""
+def test_a_refused_request_leaves_everything_as_it_was(world: PortalWorld, open_page: OpenPage) -> None:
+    """The controller continues, and the requester gets the reason."""
     ann, bob = open_page("ann"), open_page("bob")
     take_control(ann)
     stands(bob, "held")
     ask(bob)
     seen(ann, "control-refuse").click()
     stands(bob, "held")
-    was_told(bob, "ann keeps control")
+    was_notified(bob, "ann keeps control")
     stands(ann, "yours")
-    drive(house, ann)
+    drive(world, ann)
     ann.keyboard.up("a")
-    house.stands()
+    world.stands()
 
 
-def test_an_owner_takes_over_who_got_no_answer(house: Household, open_page: OpenPage) -> None:
-    """While the holder drives and does not look, the owner gets control after the grace time; the robot stands."""
+def test_an_owner_without_an_answer_takes_over(world: PortalWorld, open_page: OpenPage) -> None:
+    """The controller drives and does not answer: the owner gets control after the grace time, and the robot
+    stands.
+    """
     ann, olga = open_page("ann"), open_page("olga")
     take_control(ann)
     stands(olga, "held")
-    drive(house, ann)
+    drive(world, ann)
     ask(olga)
-    stands(olga, "ripe")
+    stands(olga, "may_take_over")
     seen(olga, "control-over").click()
     stands(olga, "yours")
-    house.stands()
+    world.stands()
     expect(seen(ann, "drive-words")).to_have_text("olga has control now.")
-    was_told(ann, "you have lost control of rover: olga has taken over")
+    was_notified(ann, "you have lost control of rover: olga has taken over")
     ann.keyboard.up("a")
 
 
-def test_of_two_who_take_it_at_once_one_has_it(house: Household, open_page: OpenPage) -> None:
-    """Both press the button in the same moment; one drives, the other sees who."""
+def test_one_of_two_simultaneous_requests_gets_control(world: PortalWorld, open_page: OpenPage) -> None:
+    """Both press the button at the same time; one drives, the other sees the controller."""
     ann, bob = open_page("ann"), open_page("bob")
     for page in (ann, bob):
         stands(page, "free")
@@ -141,19 +148,19 @@ def test_of_two_who_take_it_at_once_one_has_it(house: Household, open_page: Open
     assert sorted(badge.inner_text() == "You have control" for badge in badges) == [False, True]
 
 
-def test_control_goes_with_the_page_that_had_it(house: Household, open_page: OpenPage) -> None:
-    """Closing the tab while driving stops the robot and frees it for the others."""
+def test_control_goes_with_the_page_that_had_it(world: PortalWorld, open_page: OpenPage) -> None:
+    """Closing the tab while driving stops the robot and releases control."""
     ann, bob = open_page("ann"), open_page("bob")
     take_control(ann)
     stands(bob, "held")
-    drive(house, ann)
+    drive(world, ann)
     ann.close()
     stands(bob, "free")
-    house.stands()
+    world.stands()
 
 
-def test_who_is_here_and_who_has_control_is_shown(house: Household, open_page: OpenPage) -> None:
-    """Everybody sees everybody, and the mark at who has control; an owner sees addresses too."""
+def test_users_and_controller_are_shown(world: PortalWorld, open_page: OpenPage) -> None:
+    """Every user sees all users, with a mark at the controller; an owner sees addresses too."""
     ann, olga = open_page("ann"), open_page("olga")
     take_control(ann)
     for page in (ann, olga):
@@ -168,13 +175,13 @@ def test_who_is_here_and_who_has_control_is_shown(house: Household, open_page: O
 # --- stop -------------------------------------------------------------------------------------------------
 
 
-def test_a_viewer_stops_who_drives(house: Household, open_page: OpenPage) -> None:
-    """STOP on the viewer's screen halts the robot and bars the driver, who alone of the two may resume."""
+def test_a_viewer_stops_the_driver(world: PortalWorld, open_page: OpenPage) -> None:
+    """STOP on the viewer's page stops the robot and locks out the driver, who may resume; the viewer may not."""
     ann, vera = open_page("ann"), open_page("vera")
     take_control(ann)
-    drive(house, ann)
+    drive(world, ann)
     seen(vera, "stop").click()
-    house.stands()
+    world.stands()
     for page in (ann, vera):
         expect(seen(page, "stopped")).to_contain_text("The robot is stopped. By vera")
     expect(seen(vera, "resume")).to_have_count(0)
@@ -184,36 +191,38 @@ def test_a_viewer_stops_who_drives(house: Household, open_page: OpenPage) -> Non
     ann.keyboard.press("a")
     hold_joystick(ann)
     ann.mouse.up()
-    ann.wait_for_timeout(500)  # proves absence
-    assert house.movements(since) == []
+    ann.wait_for_timeout(500)  # shows absence
+    assert world.movements(since) == []
 
     seen(ann, "resume").click()
-    ann.wait_for_timeout(300)  # proves absence
+    ann.wait_for_timeout(300)  # shows absence
     expect(seen(vera, "stopped")).to_be_visible()
     hold_resume(ann)
     expect(seen(vera, "stopped")).to_have_count(0)
-    drive(house, ann)
+    drive(world, ann)
     ann.keyboard.up("a")
-    house.stands()
+    world.stands()
 
 
 @pytest.mark.parametrize("button", ["resume", "order-resume"])
-def test_a_second_stop_ends_a_press_to_resume(house: Household, open_page: OpenPage, button: str) -> None:
-    """Somebody stops the stopped robot once more while another holds the button: it stays stopped, and he is named."""
+def test_a_second_stop_ends_a_press_to_resume(world: PortalWorld, open_page: OpenPage, button: str) -> None:
+    """The second stop comes while another user holds the resume button: the robot stays stopped, with the
+    second user's name.
+    """
     vera, ann = open_page("vera"), open_page("ann")
     olga = open_page("olga", COCKPIT if button == "resume" else "/fleet")
     if button == "order-resume":
         seen(olga, "fleet-order").click()
         seen(olga, "order-pattern").fill("rover")
         seen(olga, "order-do").select_option("resume")
-    # Where the second stop took longer than the finger, the press was not ended by it.
+    # If the second stop took longer than the press, it did not interrupt it.
     for _ in range(5):
         stop_by(vera)
         expect(seen(olga, "stopped" if button == "resume" else "robot-stopped")).to_be_visible()
         seen(olga, button).focus()
         olga.keyboard.down("Enter")
         stop_by(ann)
-        olga.wait_for_timeout(2500)  # proves absence
+        olga.wait_for_timeout(2500)  # shows absence
         olga.keyboard.up("Enter")
         if "Again by ann" in seen(vera, "stopped").inner_text():
             break
@@ -226,31 +235,31 @@ def test_a_second_stop_ends_a_press_to_resume(house: Household, open_page: OpenP
     olga.keyboard.up("Enter")
 
 
-def test_stop_goes_without_a_websocket(house: Household, open_page: OpenPage) -> None:
-    """On a screen whose websockets never open STOP goes by HTTP, and halts who drives elsewhere."""
+def test_stop_goes_without_a_websocket(world: PortalWorld, open_page: OpenPage) -> None:
+    """On a page whose websockets cannot open, STOP uses HTTP and stops another user's driving."""
 
     def cut(route: WebSocketRoute) -> None:
-        """Connected to nobody."""
+        """Connects to nothing."""
 
     ann = open_page("ann")
     vera = open_page("vera", prepare=lambda page: page.route_web_socket(re.compile("/robots/"), cut))
     take_control(ann)
-    drive(house, ann)
+    drive(world, ann)
     seen(vera, "stop").click()
-    house.stands()
+    world.stands()
     expect(seen(ann, "stopped")).to_contain_text("By vera")
     expect(seen(vera, "drive-words")).to_have_text("The robot is stopped.")
     ann.keyboard.up("a")
     hold_resume(ann)
 
 
-def test_all_robots_are_stopped_and_resumed_from_the_list(house: Household, open_page: OpenPage) -> None:
-    """STOP all halts who drives; the order to resume goes to a pattern, with a result for each robot."""
+def test_all_robots_are_stopped_and_resumed_from_the_list(world: PortalWorld, open_page: OpenPage) -> None:
+    """STOP all stops driven robots; resuming uses a pattern, with a result for each robot."""
     ann, olga = open_page("ann"), open_page("olga", "/fleet")
     take_control(ann)
-    drive(house, ann)
+    drive(world, ann)
     olga.get_by_role("button", name="Stop all robots").click()
-    house.stands()
+    world.stands()
     ann.keyboard.up("a")
     expect(seen(olga, "robot-stopped")).to_be_visible()
     expect(seen(olga, "robot-holder")).to_have_text("ann")
@@ -266,7 +275,7 @@ def test_all_robots_are_stopped_and_resumed_from_the_list(house: Household, open
     expect(seen(ann, "stopped")).to_have_count(0)
 
 
-# --- letting go -------------------------------------------------------------------------------------------
+# --- release ----------------------------------------------------------------------------------------------
 
 
 LEAVING = {
@@ -277,18 +286,18 @@ LEAVING = {
 }
 
 
-@pytest.mark.parametrize("way", LEAVING)
-def test_a_page_that_goes_out_of_sight_says_zero(house: Household, open_page: OpenPage, way: str) -> None:
-    """A tab that is hidden, frozen by the browser or loses the focus sends zero, and nothing after it."""
+@pytest.mark.parametrize("script", LEAVING)
+def test_a_page_that_is_hidden_sends_zero(world: PortalWorld, open_page: OpenPage, script: str) -> None:
+    """A tab that is hidden, frozen or loses the focus sends zero, and no command after it."""
     page = open_page("ann")
     ready_to_drive(page)
-    since = drive(house, page)
-    page.evaluate(LEAVING[way])
-    wait_for("a zero came", lambda: house.commands(since)[-1:] == [(0, 0)])
-    house.stands()
-    told = len(house.commands(since))
-    page.wait_for_timeout(700)  # proves absence
-    assert [each for each in house.commands(since)[told:] if each != (0, 0)] == []
+    since = drive(world, page)
+    page.evaluate(LEAVING[script])
+    wait_for("a zero came", lambda: world.commands(since)[-1:] == [(0, 0)])
+    world.stands()
+    reported = len(world.commands(since))
+    page.wait_for_timeout(700)  # shows absence
+    assert [each for each in world.commands(since)[reported:] if each != (0, 0)] == []
     page.keyboard.up("a")
 
 
@@ -299,31 +308,35 @@ PAD = """
 """
 
 
-@pytest.mark.parametrize("way", ["pad.buttons[4].pressed = false", "window.pad = null"])
-def test_a_gamepad_that_is_let_go_or_gone_stops(house: Household, open_page: OpenPage, way: str) -> None:
-    """It drives while its shoulder button is held, and no longer."""
+@pytest.mark.parametrize("script", ["pad.buttons[4].pressed = false", "window.pad = null"])
+def test_a_released_or_disconnected_gamepad_stops_the_robot(
+    world: PortalWorld, open_page: OpenPage, script: str
+) -> None:
+    """It drives only while its shoulder button is held."""
     page = open_page("ann", prepare=lambda page: page.add_init_script(PAD))
     ready_to_drive(page)
     seen(page, "input-gamepad").click()
     expect(seen(page, "gamepad")).to_have_attribute("data-pad", "ready")
-    assert not house.robot.moving()
+    assert not world.robot.moving()
     page.evaluate("pad.buttons[4].pressed = true")
-    house.moves()
-    page.evaluate(way)
-    house.stands()
+    world.moves()
+    page.evaluate(script)
+    world.stands()
 
 
 # --- alerts -----------------------------------------------------------------------------------------------
 
 
-def test_who_looks_elsewhere_is_told_that_a_robot_is_gone(house: Household, open_page: OpenPage) -> None:
-    """A toast and a count in the top bar; on the page of alerts it is acknowledged, and over when it is back."""
+def test_portal_on_another_page_shows_a_lost_robot(world: PortalWorld, open_page: OpenPage) -> None:
+    """A toast and a count in the top bar; the page of alerts acknowledges it, and shows its end when the
+    robot is back.
+    """
     ann, vera = open_page("ann", "/fleet"), open_page("vera", "/alerts")
     expect(seen(ann, "robot-card")).to_have_count(1)
     expect(seen(vera, "alerts-empty")).to_be_visible()
-    house.robot.daemon.stop()
+    world.robot.daemon.stop()
     try:
-        was_told(ann, "rover")
+        was_notified(ann, "rover")
         expect(seen(ann, "alerts-count")).to_have_text("1")
         alert = vera.locator("[data-testid=alert][data-kind=offline]")
         expect(alert).to_contain_text("rover")
@@ -333,8 +346,8 @@ def test_who_looks_elsewhere_is_told_that_a_robot_is_gone(house: Household, open
         expect(alert).to_contain_text("ann looks after it")
         expect(seen(ann, "alerts-count")).to_have_count(0)
     finally:
-        house.robot.start_daemon()
-        house.robot.wait_online()
+        world.robot.start_daemon()
+        world.robot.wait_online()
     expect(alert).to_have_count(0)
     seen(vera, "alerts-over").click()
     expect(alert).to_contain_text("over")

@@ -1,4 +1,4 @@
-"""One robot on a laptop, a tablet and a phone at the same time: a real browser, relay and simulated robot."""
+"""One robot on a laptop, a tablet and a phone at the same time: real browser and relay, simulated robot."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import NamedTuple
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from switchboard_browser import lived_in, picture, seen, stands, take_control
-from switchboard_household import Household, OpenPage, pages_of
-from switchboard_touch import Finger
-from switchboard_waiting import wait_for
+
+from tests.worlds.browser import SMALL_CAMERA, picture, running_world, seen, stands, take_control
+from tests.worlds.portal_relay import OpenPage, PortalWorld, pages_of
+from tests.worlds.touch import TouchPointer
+from tests.worlds.waiting import wait_for
 
 PEOPLE = {"ann": "operator", "bob": "operator", "vera": "viewer"}
-CAMERA = ("--camera-size", "320x240", "--camera-fps", "5")
 
 ASIDE = -60
 """Pixels: so far to the left the joystick turns the robot on the spot."""
 
 
 class Devices(NamedTuple):
-    """Whose cockpit is open on what."""
+    """The users' devices with open cockpits."""
 
     laptop: Page
     tablet: Page
@@ -31,24 +31,24 @@ class Devices(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Household]:
-    """One house for all; each test leaves the robot free, and able to move."""
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PortalWorld]:
+    """One world for all; each test leaves the robot without a controller and not stopped."""
 
-    def with_camera(folder: Path) -> Household:
-        return Household(folder, PEOPLE, camera=True, sim_options=CAMERA)
+    def with_camera(folder: Path) -> PortalWorld:
+        return PortalWorld(folder, PEOPLE, camera=True, sim_options=SMALL_CAMERA)
 
-    yield from lived_in(with_camera, tmp_path_factory.mktemp("devices"))
+    yield from running_world(with_camera, tmp_path_factory.mktemp("devices"))
 
 
 @pytest.fixture
-def devices(browser: Browser, house: Household) -> Iterator[Devices]:
-    """Ann has a laptop, Bob a tablet, and Vera, who may only look, a phone."""
-    with pages_of(browser, house) as open_page:
+def devices(browser: Browser, world: PortalWorld) -> Iterator[Devices]:
+    """Ann has a laptop, Bob a tablet, and Vera, a viewer, a phone."""
+    with pages_of(browser, world) as open_page:
         yield opened(open_page)
 
 
 def opened(open_page: OpenPage) -> Devices:
-    """The cockpit on each, connected."""
+    """The connected cockpit on each device."""
     made = Devices(
         open_page("ann"),
         open_page("bob", width=820, height=1180, has_touch=True),
@@ -61,7 +61,7 @@ def opened(open_page: OpenPage) -> Devices:
 
 
 def holder_is(devices: Devices, user: str) -> None:
-    """Wait until each device shows who has control."""
+    """Waits until each device shows the controller."""
     for page, mine in zip(devices, PEOPLE, strict=True):
         words = "You have control" if mine == user else f"{user} has control"
         expect(seen(page, "holder")).to_have_text(words)
@@ -69,91 +69,91 @@ def holder_is(devices: Devices, user: str) -> None:
 
 
 def picture_moves(page: Page) -> None:
-    """Wait until the camera's picture is live, and another one than it was."""
+    """Waits until the camera's picture is live and has changed."""
     expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
     before = picture(page, "camera-canvas")
     wait_for("the picture moves", lambda: picture(page, "camera-canvas") != before)
 
 
 def show_motion(devices: Devices) -> None:
-    """Wait until each device shows that the robot turns."""
+    """Waits until each device shows that the robot turns."""
     for page in devices:
         expect(seen(page, "odom-turn")).not_to_have_text(re.compile(r"^[-−]?0\.00$"))
 
 
 def show_the_same(devices: Devices) -> None:
-    """Wait until each device shows the robot standing, in the same place and direction."""
+    """Waits until each device shows the robot standing, at the same place and heading."""
 
     def shown(page: Page) -> tuple[str, ...]:
         return tuple(seen(page, f"odom-{each}").inner_text() for each in ("x", "y", "heading", "speed"))
 
     def same() -> bool:
-        told = {shown(page) for page in devices}
-        return len(told) == 1 and re.fullmatch(r"[-−]?\d+\.\d\d", min(told)[0]) is not None
+        reported = {shown(page) for page in devices}
+        return len(reported) == 1 and re.fullmatch(r"[-−]?\d+\.\d\d", min(reported)[0]) is not None
 
     wait_for("all show the same", same)
 
 
-def key_turns(house: Household, page: Page) -> None:
-    """Hold a key of the laptop until the robot moves."""
-    house.moves_by(lambda: page.keyboard.down("a"), lambda: page.keyboard.up("a"))
+def key_turns(world: PortalWorld, page: Page) -> None:
+    """Holds a key of the laptop until the robot moves."""
+    world.moves_by(lambda: page.keyboard.down("a"), lambda: page.keyboard.up("a"))
 
 
-def finger_turns(house: Household, page: Page, finger: Finger) -> None:
-    """Pull the joystick with a finger until the robot moves."""
-    house.moves_by(lambda: finger.press(seen(page, "joystick"), dx=ASIDE), finger.lift)
+def finger_turns(world: PortalWorld, page: Page, finger: TouchPointer) -> None:
+    """Drags the joystick with a finger until the robot moves."""
+    world.moves_by(lambda: finger.press(seen(page, "joystick"), dx=ASIDE), finger.lift)
 
 
-def test_all_see_the_same_robot_live(house: Household, devices: Devices) -> None:
-    """Its picture moves on each, and where it stands is the same, before it is driven and afterwards."""
+def test_all_see_the_same_robot_live(world: PortalWorld, devices: Devices) -> None:
+    """Video changes on each, and the shown position is the same before and after a drive."""
     for page in devices:
         picture_moves(page)
     show_the_same(devices)
     take_control(devices.laptop)
-    key_turns(house, devices.laptop)
+    key_turns(world, devices.laptop)
     show_motion(devices)
     devices.laptop.keyboard.up("a")
-    house.stands()
+    world.stands()
     show_the_same(devices)
 
 
-def test_control_goes_from_the_laptop_to_the_tablet(house: Household, devices: Devices) -> None:
-    """All see who has it; asked for and granted, a finger on the tablet drives, and the laptop's keys no more."""
+def test_control_goes_from_the_laptop_to_the_tablet(world: PortalWorld, devices: Devices) -> None:
+    """All see the controller. After a granted request the tablet drives, and the laptop's keys do not."""
     laptop, tablet, phone = devices
     take_control(laptop)
     holder_is(devices, "ann")
     stands(phone, "held|watching")
-    key_turns(house, laptop)
+    key_turns(world, laptop)
     seen(tablet, "control-ask").tap()
     seen(tablet, "control-ask-send").tap()
     stands(tablet, "waiting")
-    expect(seen(laptop, "control-request")).to_contain_text("bob asks for control.")
+    expect(seen(laptop, "control-request")).to_contain_text("bob requests control.")
     seen(laptop, "control-grant").click()
     holder_is(devices, "bob")
-    house.stands()
+    world.stands()
     laptop.keyboard.up("a")
     since = time.monotonic_ns()
     laptop.keyboard.press("a")
-    laptop.wait_for_timeout(500)  # proves absence: who has no control moves nothing
-    assert house.movements(since) == []
-    finger = Finger(tablet)
-    finger_turns(house, tablet, finger)
+    laptop.wait_for_timeout(500)  # shows absence: a client without control moves nothing
+    assert world.movements(since) == []
+    finger = TouchPointer(tablet)
+    finger_turns(world, tablet, finger)
     show_motion(devices)
     finger.lift()
-    house.stands()
-    turns = house.movements(since)
+    world.stands()
+    turns = world.movements(since)
     assert turns and all(turn > 0 for _, turn in turns), "pulled to the left it turns left"
 
 
-def test_the_phone_stops_the_robot_for_all(house: Household, devices: Devices) -> None:
-    """Who may only look stops who drives; each shows by whom, and the finger of who has control resumes."""
+def test_the_phone_stops_the_robot_for_all(world: PortalWorld, devices: Devices) -> None:
+    """The viewer stops the driver; each device shows the viewer's name, and the controller's touch resumes."""
     laptop, tablet, phone = devices
     take_control(tablet)
     holder_is(devices, "bob")
-    finger = Finger(tablet)
-    finger_turns(house, tablet, finger)
+    finger = TouchPointer(tablet)
+    finger_turns(world, tablet, finger)
     seen(phone, "stop").tap()
-    house.stands()
+    world.stands()
     for page in devices:
         expect(seen(page, "stopped")).to_contain_text("The robot is stopped. By vera")
     for page in (laptop, phone):
@@ -162,14 +162,14 @@ def test_the_phone_stops_the_robot_for_all(house: Household, devices: Devices) -
     finger.lift()
     since = time.monotonic_ns()
     finger.press(seen(tablet, "joystick"), dx=ASIDE)
-    tablet.wait_for_timeout(500)  # proves absence: a stopped robot is driven by nobody
-    assert house.movements(since) == []
+    tablet.wait_for_timeout(500)  # shows absence: a stopped robot cannot be driven
+    assert world.movements(since) == []
     finger.lift()
 
     finger.press(seen(tablet, "resume"))
     for page in devices:
         expect(seen(page, "stopped")).to_have_count(0)
     finger.lift()
-    finger_turns(house, tablet, finger)
+    finger_turns(world, tablet, finger)
     finger.lift()
-    house.stands()
+    world.stands()

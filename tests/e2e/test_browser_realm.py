@@ -1,4 +1,4 @@
-"""An administrator sees to his realm in the portal, in a real browser with the real relay behind it."""
+"""An administrator manages their realm in the portal, in a real browser with a real relay."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
-from switchboard_browser import lived_in, seen, sound_pages, was_told
-from switchboard_forks import run_command
-from switchboard_relay import Relay
+
+from tests.worlds.browser import checked_pages, open_session, running_world, seen, was_notified
+from tests.worlds.forked_programs import run_command
+from tests.worlds.relay_process import Relay
 
 PASSWORD = "correct horse"
 WAIT_SECONDS = 60.0
@@ -22,7 +23,7 @@ GROUPS = re.compile(r"/api/v1/realm/groups$")
 OpenPage = Callable[..., Page]
 
 
-class House:
+class World:
     """A relay with an administrator ``root``, a user ``guest``, and a robot ``mower`` that has not enrolled."""
 
     def __init__(self, folder: Path) -> None:
@@ -32,28 +33,26 @@ class House:
         self.relay.cli("robot", "add", "mower", "--description", "Cuts the lawn")
 
     def stop(self) -> None:
-        """End everything."""
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """One house for all; each test has robots and people of its own."""
-    yield from lived_in(House, tmp_path_factory.mktemp("realm"))
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """One world for all; each test has robots and users of its own."""
+    yield from running_world(World, tmp_path_factory.mktemp("realm"))
 
 
 @pytest.fixture
-def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
-    """Opens pages of somebody who has logged in; an uncaught error or a breach of the CSP fails the test."""
-    url = f"http://127.0.0.1:{house.relay.http_port}"
-    with sound_pages(browser, url, WAIT_SECONDS) as new_page:
+def open_page(browser: Browser, world: World) -> Iterator[OpenPage]:
+    """Opens pages of a logged-in user; an uncaught error or a violation of the CSP fails the test."""
+    url = f"http://127.0.0.1:{world.relay.http_port}"
+    with checked_pages(browser, url, WAIT_SECONDS) as new_page:
 
         def open_page(
             path: str, user: str = "root", password: str = PASSWORD, width: int = 1280, height: int = 800
         ) -> Page:
             page = new_page(width, height)
-            log_in(page, user, password)
-            seen(page, "user-menu").wait_for()
+            open_session(page, user, password)
             page.goto(path)
             return page
 
@@ -61,7 +60,7 @@ def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
 
 
 def log_in(page: Page, user: str, password: str = PASSWORD) -> None:
-    """Fill in the form."""
+    """Submits the login form."""
     page.goto("/login")
     seen(page, "login-user").fill(user)
     seen(page, "login-password").fill(password)
@@ -85,8 +84,8 @@ def inside(place: Locator, testid: str) -> Locator:
     return place.get_by_test_id(testid)
 
 
-def add_person(page: Page, name: str, password: str) -> None:
-    """On the page of people."""
+def add_user(page: Page, name: str, password: str) -> None:
+    """Adds a user on the page of people."""
     seen(page, "person-add").click()
     seen(page, "person-name").fill(name)
     seen(page, "person-password").fill(password)
@@ -95,7 +94,7 @@ def add_person(page: Page, name: str, password: str) -> None:
 
 
 def give(page: Page, robot: str, holder: str, level: str) -> None:
-    """A right, on the page of rights."""
+    """Gives a right on the page of rights."""
     here = page.locator(f"[data-testid=rights-of][data-robot='{robot}']")
     inside(here, "right-add-here").click()
     inside(here, "grant-who").fill(holder)
@@ -105,9 +104,9 @@ def give(page: Page, robot: str, holder: str, level: str) -> None:
 
 
 def test_a_robot_is_added_and_enrols_by_the_command_that_is_shown(
-    house: House, open_page: OpenPage, tmp_path: Path
+    world: World, open_page: OpenPage, tmp_path: Path
 ) -> None:
-    """What is wrong with a name is told beside it; the code lets the robot in, and its key is seen and retired."""
+    """Errors of a name are shown beside it; the code enrols the robot, and its key is listed and retired."""
     page = open_page("/fleet")
     seen(page, "realm-link").click()
     seen(page, "robot-add").click()
@@ -118,14 +117,14 @@ def test_a_robot_is_added_and_enrols_by_the_command_that_is_shown(
     expect(seen(page, "robot-description")).to_have_value("In the hall")
     seen(page, "robot-name").fill("mower")
     seen(page, "robot-add-sure").click()
-    expect(seen(page, "realm-problem")).to_contain_text("There is a robot 'mower' already")
+    expect(seen(page, "realm-problem")).to_contain_text("The robot 'mower' exists already")
     seen(page, "robot-name").fill("rover-one")
-    # Robots that are not shown enrol as well.
+    # A robot that is not shared enrols as well.
     seen(page, "realm-search").fill("nothing like it")
     expect(row(page, "robot", "mower")).to_have_count(0)
     seen(page, "robot-add-sure").click()
 
-    expect(seen(page, "realm-code-until")).to_contain_text(re.compile(r"Good until .+, for 15 minutes"))
+    expect(seen(page, "realm-code-until")).to_contain_text(re.compile(r"Valid until .+, for 15 minutes"))
     command = shlex.split(seen(page, "realm-command").inner_text())
     command[command.index("--state") + 1] = str(tmp_path / "state")
     done = run_command(command, stdin=seen(page, "realm-code-text").inner_text() + "\n")
@@ -143,9 +142,9 @@ def test_a_robot_is_added_and_enrols_by_the_command_that_is_shown(
     expect(inside(robot, "robot-keys")).to_have_text("Not enrolled yet")
 
 
-def test_each_enrolment_is_seen(house: House, open_page: OpenPage, tmp_path: Path) -> None:
-    """Also the third, by which the oldest of two live keys is retired and there are as many as before."""
-    house.relay.cli("robot", "add", "veteran")
+def test_enrolment_is_published(world: World, open_page: OpenPage, tmp_path: Path) -> None:
+    """The third one retires the oldest of two live keys, so their number stays the same."""
+    world.relay.cli("robot", "add", "veteran")
     page = open_page("/realm/robots")
     robot = row(page, "robot", "veteran")
     for number in range(3):
@@ -159,10 +158,10 @@ def test_each_enrolment_is_seen(house: House, open_page: OpenPage, tmp_path: Pat
     expect(inside(robot, "robot-keys")).to_have_text("2 live keys")
 
 
-def test_rights_that_can_not_be_asked_for_are_told_to_be_old(house: House, open_page: OpenPage) -> None:
-    """Who looks for somebody's rights is not to take those of another for them."""
-    house.relay.user("daisy")
-    house.relay.cli("right", "grant", "daisy", "mower", "viewer")
+def test_rights_that_can_not_be_loaded_are_marked_as_old(world: World, open_page: OpenPage) -> None:
+    """Rights of one user must not be taken for those of another."""
+    world.relay.user("daisy")
+    world.relay.cli("right", "grant", "daisy", "mower", "viewer")
     page = open_page("/realm/rights")
     expect(right(page, "mower", "daisy")).to_be_visible()
     page.route("**/api/v1/realm/rights?*", lambda route: route.abort())
@@ -170,9 +169,11 @@ def test_rights_that_can_not_be_asked_for_are_told_to_be_old(house: House, open_
     expect(seen(page, "realm-problem")).to_be_visible()
 
 
-def test_a_robot_is_removed_after_it_was_said_what_goes_with_it(house: House, open_page: OpenPage) -> None:
-    """To keep it is one press; a new code is shown for it until then."""
-    house.relay.cli("robot", "add", "old-one")
+def test_a_robot_is_removed_after_a_warning_about_what_is_removed_with_it(
+    world: World, open_page: OpenPage
+) -> None:
+    """The dialog lists what is removed; one press cancels it; a new code is shown until then."""
+    world.relay.cli("robot", "add", "old-one")
     page = open_page("/realm/robots")
     robot = row(page, "robot", "old-one")
     inside(robot, "robot-code").click()
@@ -188,11 +189,11 @@ def test_a_robot_is_removed_after_it_was_said_what_goes_with_it(house: House, op
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_person_gets_a_right_and_loses_it(house: House, open_page: OpenPage, width: int) -> None:
-    """Who was added with a password sees the robot while he has the right, and not after; nothing needs a wide page."""
+def test_a_user_gets_a_right_and_loses_it(world: World, open_page: OpenPage, width: int) -> None:
+    """A user added with a password sees the robot only with the right; all pages fit a phone."""
     name = f"luigi-{width}"
     page = open_page("/realm/people", width=width)
-    add_person(page, name, "it is me again")
+    add_user(page, name, "it is me again")
     seen(page, "realm-rights").click()
     give(page, "mower", name, "operator")
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
@@ -207,12 +208,14 @@ def test_a_person_gets_a_right_and_loses_it(house: House, open_page: OpenPage, w
     expect(seen(other, "fleet-empty")).to_be_visible()
 
 
-def test_a_right_is_changed_in_place_and_not_lost_by_accident(house: House, open_page: OpenPage) -> None:
-    """Another level keeps the patterns; a second right is asked about, and a pattern that is none is told in words."""
+def test_a_right_is_changed_in_place_and_not_lost_by_accident(world: World, open_page: OpenPage) -> None:
+    """Another level keeps the patterns; a second right asks for confirmation, and an invalid pattern shows an
+    error.
+    """
     for name in ("ann", "bob"):
-        house.relay.user(name)
-    house.relay.cli("right", "grant", "ann", "mower", "viewer", "--deny", "call:/blade")
-    house.relay.cli("right", "grant", "bob", "mower", "viewer")
+        world.relay.user(name)
+    world.relay.cli("right", "grant", "ann", "mower", "viewer", "--deny", "call:/blade")
+    world.relay.cli("right", "grant", "bob", "mower", "viewer")
     page = open_page("/realm/rights?who=ann")
     ann = right(page, "mower", "ann")
     expect(ann).to_have_attribute("data-level", "viewer")
@@ -224,7 +227,7 @@ def test_a_right_is_changed_in_place_and_not_lost_by_accident(house: House, open
     inside(ann, "right-edit").click()
     inside(ann, "right-allow").fill("mow:/lawn")
     inside(ann, "right-save").click()
-    expect(inside(ann, "realm-problem")).to_contain_text("'mow:/lawn' is no pattern")
+    expect(inside(ann, "realm-problem")).to_contain_text("'mow:/lawn' is not a pattern")
     expect(inside(ann, "right-allow")).to_have_value("mow:/lawn")
     inside(ann, "right-allow").fill("call:/mow")
     inside(ann, "right-save").click()
@@ -242,18 +245,18 @@ def test_a_right_is_changed_in_place_and_not_lost_by_accident(house: House, open
     expect(inside(ann, "right-denied")).to_have_count(0)
 
 
-def test_two_administrators_do_not_overwrite_each_other(house: House, open_page: OpenPage) -> None:
-    """Who changes what somebody else has changed meanwhile is told so and sees how it is now; what he typed stays."""
+def test_two_administrators_do_not_overwrite_each_other(world: World, open_page: OpenPage) -> None:
+    """A conflict shows a message and the present state; typed text is kept."""
     for name in ("bowser", "yoshi"):
-        house.relay.user(name)
-    house.relay.cli("right", "grant", "bowser", "mower", "viewer")
+        world.relay.user(name)
+    world.relay.cli("right", "grant", "bowser", "mower", "viewer")
     page = open_page("/realm/rights")
     bowser = right(page, "mower", "bowser")
     inside(bowser, "right-edit").click()
     inside(bowser, "right-allow").fill("call:/mow")
-    house.relay.cli("right", "grant", "bowser", "mower", "operator", "--deny", "call:/blade")
+    world.relay.cli("right", "grant", "bowser", "mower", "operator", "--deny", "call:/blade")
     inside(bowser, "right-save").click()
-    expect(inside(bowser, "realm-problem")).to_contain_text("Somebody else has changed this meanwhile")
+    expect(inside(bowser, "realm-problem")).to_contain_text("Another user has changed this")
     expect(bowser).to_have_attribute("data-level", "operator")
     expect(inside(bowser, "right-denied")).to_contain_text("call:/blade")
     expect(inside(bowser, "right-allow")).to_have_value("call:/mow")
@@ -261,26 +264,26 @@ def test_two_administrators_do_not_overwrite_each_other(house: House, open_page:
     expect(inside(bowser, "right-allowed")).to_contain_text("call:/mow")
     expect(bowser).to_have_attribute("data-level", "operator")
 
-    house.relay.cli("right", "revoke", "bowser", "mower")
+    world.relay.cli("right", "revoke", "bowser", "mower")
     inside(bowser, "level-owner").click()
-    was_told(page, "Somebody else has removed this meanwhile")
+    was_notified(page, "Another user has removed this")
     expect(bowser).to_have_count(0)
 
     page.goto("/realm/people")
     yoshi = row(page, "person", "yoshi")
     inside(yoshi, "person-manage").click()
-    house.relay.cli("user", "disable", "yoshi")
+    world.relay.cli("user", "disable", "yoshi")
     inside(yoshi, "person-make-admin").click()
-    expect(inside(yoshi, "realm-problem")).to_contain_text("Somebody else has changed this meanwhile")
+    expect(inside(yoshi, "realm-problem")).to_contain_text("Another user has changed this")
     expect(yoshi).to_contain_text("Disabled")
     expect(yoshi).not_to_contain_text("Administrator")
     inside(yoshi, "person-make-admin").click()
     expect(yoshi).to_contain_text("Administrator")
 
 
-def test_what_a_group_may_do_is_seen_with_who_is_in_it(house: House, open_page: OpenPage) -> None:
-    """A group is added, filled, given a right and removed; the right goes with it."""
-    house.relay.user("mario")
+def test_group_is_listed_with_rights_and_members(world: World, open_page: OpenPage) -> None:
+    """A group is added, filled, given a right and removed with its right."""
+    world.relay.user("mario")
     page = open_page("/realm/groups")
     seen(page, "group-add").click()
     seen(page, "group-name").fill("crew")
@@ -311,9 +314,11 @@ def test_what_a_group_may_do_is_seen_with_who_is_in_it(house: House, open_page: 
     expect(right(page, "mower", "@crew")).to_have_count(0)
 
 
-def test_people_are_shut_out_let_in_and_made_administrators(house: House, open_page: OpenPage) -> None:
-    """A new password and a revoked session are for somebody else to notice at once; oneself nobody can remove."""
-    house.relay.user("peach")
+def test_users_are_disabled_enabled_and_made_administrators(world: World, open_page: OpenPage) -> None:
+    """Another user gets a new password, and sessions are revoked at once; administrators cannot remove
+    themselves.
+    """
+    world.relay.user("peach")
     other = open_page("/fleet", "peach")
     page = open_page("/realm/people")
     peach = row(page, "person", "peach")
@@ -328,7 +333,7 @@ def test_people_are_shut_out_let_in_and_made_administrators(house: House, open_p
     expect(inside(peach, "realm-problem")).to_contain_text("8 characters")
     inside(peach, "person-new-password").fill("another castle")
     inside(peach, "person-set-password").click()
-    was_told(page, "peach has a new password")
+    was_notified(page, "peach has a new password")
     inside(peach, "person-disable").click()
     expect(peach).to_contain_text("Disabled")
     log_in(other, "peach", "another castle")
@@ -351,10 +356,10 @@ def test_people_are_shut_out_let_in_and_made_administrators(house: House, open_p
     expect(seen(other, "login-submit")).to_be_visible()
 
 
-def test_a_long_list_is_shown_in_parts_and_filtered_by_name(house: House, open_page: OpenPage) -> None:
-    """The filter finds what the part that is shown does not have."""
+def test_a_long_list_is_shown_in_parts_and_filtered_by_name(world: World, open_page: OpenPage) -> None:
+    """The filter finds entries beyond the shown part."""
     for number in range(101):
-        house.relay.cli("group", "add", f"many-{number:03d}")
+        world.relay.cli("group", "add", f"many-{number:03d}")
     page = open_page("/realm/groups")
     expect(seen(page, "realm-group")).to_have_count(100)
     seen(page, "realm-more").click()
@@ -368,8 +373,8 @@ def test_a_long_list_is_shown_in_parts_and_filtered_by_name(house: House, open_p
     expect(seen(page, "realm-empty")).to_contain_text("Nothing matches")
 
 
-def test_who_changes_too_much_is_told_how_long_to_wait(open_page: OpenPage) -> None:
-    """What he typed stays, and a second press does it."""
+def test_too_many_changes_are_refused_with_retry_after(open_page: OpenPage) -> None:
+    """Typed text is kept, and a later press succeeds."""
     page = open_page("/realm/groups")
     problem = {"title": "Too Many Requests", "status": 429, "detail": "this realm is changed too often"}
     refused = {"status": 429, "headers": {"Retry-After": "2"}, "json": problem}
@@ -383,8 +388,8 @@ def test_who_changes_too_much_is_told_how_long_to_wait(open_page: OpenPage) -> N
     expect(row(page, "group", "hasty")).to_be_visible()
 
 
-def test_others_are_told_that_it_is_not_for_them(open_page: OpenPage) -> None:
-    """No link leads there, neither in the bar nor in the menu; the address says in words why there is nothing."""
+def test_users_without_the_right_see_a_refusal(open_page: OpenPage) -> None:
+    """Neither the bar nor the menu has a link; the address shows the reason."""
     page = open_page("/fleet", "guest")
     expect(seen(page, "alerts-link")).to_be_visible()
     expect(seen(page, "realm-link")).to_have_count(0)

@@ -1,4 +1,4 @@
-"""The cockpit's cameras in a real browser: real relay, daemon, camera process and simulated camera behind them."""
+"""The cockpit's cameras in a real browser: real relay, daemon and camera process, simulated camera."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ import numpy as np
 import psutil
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
-from switchboard_browser import lived_in, sound_pages
-from switchboard_proxy import ChaosProxy
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_video import CAMERA, decoded, get
-from switchboard_waiting import wait_for
+
+from tests.worlds.browser import checked_pages, open_session, running_world
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.video_clients import CAMERA, decoded, get
+from tests.worlds.waiting import wait_for
 
 PASSWORD = "correct horse"
 WAIT_SECONDS = 60.0
@@ -34,17 +35,23 @@ REVOKED = f"Your right to view {CAMERA} was revoked."
 OpenPage = Callable[[], Page]
 
 
-class House:
-    """A relay, a robot with its camera on, a watcher."""
+class World:
+    """A relay, a robot with its camera on, a viewer."""
 
     def __init__(self, folder: Path) -> None:
         self.modules = folder / "modules"
         """Where the robot's Python looks for modules first."""
         self.modules.mkdir()
         self.relay = Relay(folder)
-        # Where ROS is installed rather than a wheel, its modules are found by this path.
+        # With an installed ROS, unlike a wheel, its modules are found by this path.
         paths = os.pathsep.join(filter(None, (str(self.modules), os.environ.get("PYTHONPATH"))))
-        self.robot = Robot(self.relay, "rover", camera=True, daemon_env={"PYTHONPATH": paths})
+        self.robot = Robot(
+            self.relay,
+            "rover",
+            camera=True,
+            sim_options=("--no-depth",),
+            daemon_env={"PYTHONPATH": paths},
+        )
         self.watcher = self.relay.user("watcher")
         self.relay.cli("right", "grant", "watcher", "rover", "viewer")
 
@@ -55,21 +62,21 @@ class House:
         wait_for("its cameras are known", lambda: cameras() == {CAMERA, COMPRESSED})
 
     def snapshot(self, **parameters: Any) -> bytes:
-        """What the robot sees now, as JPEG."""
+        """A JPEG of the robot's camera."""
         return get(self.relay, self.watcher, "snapshot", **parameters).body
 
     def scene(self, **parameters: Any) -> Any:
-        """What the robot sees now: pixels, height × width × 3."""
+        """The robot's camera as pixels, height × width × 3."""
         return decoded(self.snapshot(**parameters))
 
     def streams(self) -> list[dict[str, Any]]:
-        """The robot's streams as ``/relay/status`` tells of them."""
+        """The robot's streams in ``/relay/status``."""
         with self.relay.connect("rover", self.watcher) as client:
             client.send(op="subscribe", topic="/relay/status")
             return list(client.until(op="publish", topic="/relay/status")["msg"]["video"])
 
     def until_streamed(self, camera: str, **like: Any) -> None:
-        """Wait until one stream of a camera is watched, and is like this."""
+        """Waits until one stream of a camera has viewers and these values."""
 
         def there() -> bool:
             watched = [each for each in self.streams() if each["camera"] == camera and each["viewers"]]
@@ -78,7 +85,7 @@ class House:
         wait_for(f"{camera} is shown with {like}", there)
 
     def camera_process(self) -> psutil.Process:
-        """The daemon's process that makes pictures, once it has one."""
+        """The daemon's camera process, once it runs."""
 
         def found() -> psutil.Process | None:
             children = psutil.Process(self.robot.daemon.popen.pid).children()
@@ -88,34 +95,33 @@ class House:
         return process
 
     def links(self) -> int:
-        """How many streams its camera process sends, each by a connection of its own."""
+        """The number of streams of the camera process, each with its own connection."""
         connections = self.camera_process().net_connections("tcp")
         return sum(bool(each.raddr) and each.raddr.port == self.relay.robots_port for each in connections)
 
     def stop(self) -> None:
-        """End everything."""
         self.robot.stop()
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """One house for all; each test leaves its robot online."""
-    yield from lived_in(House, tmp_path_factory.mktemp("browser"))
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """One world for all; each test leaves its robot online."""
+    yield from running_world(World, tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture
-def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
-    """Opens cockpits; an uncaught error or a breach of the CSP in any of them fails the test."""
-    with sound_pages(browser, f"http://127.0.0.1:{house.relay.http_port}", WAIT_SECONDS) as new_page:
+def open_page(browser: Browser, world: World) -> Iterator[OpenPage]:
+    """Opens cockpits; an uncaught error or a violation of the CSP in any of them fails the test."""
+    with checked_pages(
+        browser, f"http://127.0.0.1:{world.relay.http_port}", WAIT_SECONDS, steady=False
+    ) as new_page:
         yield lambda: in_cockpit(new_page(1280, 800))
 
 
 def in_cockpit(page: Page) -> Page:
-    """The cockpit, with a picture that runs."""
-    credentials = {"user": "watcher", "password": PASSWORD}
-    headers = {"X-Requested-With": "switchboard"}
-    assert page.request.post("/api/v1/session", data=credentials, headers=headers).ok
+    """The cockpit with live video."""
+    open_session(page, "watcher", PASSWORD)
     page.goto("/cockpit/rover")
     expect(part(page, "fps")).to_have_text(RUNS)
     return page
@@ -135,13 +141,13 @@ def pane(page: Page, camera: str) -> Locator:
 
 
 def shown(where: Page | Locator) -> Any:
-    """What a canvas shows: pixels, height × width × 3."""
+    """Pixels of a canvas, height × width × 3."""
     data = part(where, "canvas").evaluate("canvas => canvas.toDataURL('image/png')")
     return decoded(base64.b64decode(data.partition(",")[2]))
 
 
 def goes_on(where: Page | Locator, seconds: float = WAIT_SECONDS) -> None:
-    """Wait until the picture on a canvas is another one, whose clock has gone on."""
+    """Waits until the canvas shows another frame with a later clock."""
     before = shown(where)
 
     def changed() -> bool:
@@ -152,7 +158,7 @@ def goes_on(where: Page | Locator, seconds: float = WAIT_SECONDS) -> None:
 
 
 def ask_for(page: Page, **wanted: str) -> None:
-    """Choose in the controls."""
+    """Sets a value in the controls."""
     if not part(page, "controls").is_visible():
         part(page, "settings").click()
     for name, value in wanted.items():
@@ -160,12 +166,12 @@ def ask_for(page: Page, **wanted: str) -> None:
 
 
 def same_scene(picture: Any, other: Any) -> bool:
-    """Whether two pictures of a robot that stands show the same, but for the clock."""
+    """Whether two pictures of a standing robot are equal, except for the clock."""
     return picture.shape == other.shape and bool(cv2.absdiff(picture, other).mean() < 8)
 
 
 def listen(where: Locator) -> None:
-    """From now on the page keeps what is said over a picture, and when."""
+    """From now on the page records messages over the video, with their times."""
     where.evaluate(
         """pane => {
             window.heard = []
@@ -179,8 +185,8 @@ def listen(where: Locator) -> None:
     )
 
 
-def heard(page: Page, words: str) -> float:
-    """Wait until something is said over the picture; the Unix time at which it was."""
+def text_shown(page: Page, words: str) -> float:
+    """Waits for a message over the video; returns its Unix time."""
 
     def found() -> float | None:
         return next((at for at, said in page.evaluate("window.heard") if words in said), None)
@@ -189,63 +195,63 @@ def heard(page: Page, words: str) -> float:
 
 
 def gone(process: psutil.Process) -> bool:
-    """Whether it has ended; who would reap it may have been killed before it."""
+    """Whether it has ended; its parent may have been killed before reaping it."""
     try:
         return process.status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
         return True
 
 
-def test_what_is_chosen_is_what_comes(house: House, open_page: OpenPage) -> None:
-    """Size, quality, rate and rotation reach the robot, and the picture has them; what is told of rate, age and bytes
-    is so.
+def test_chosen_values_are_delivered(world: World, open_page: OpenPage) -> None:
+    """Size, quality, rate and rotation reach the robot, and the picture has them; the shown rate, delay and
+    bytes are right.
     """
     page = open_page()
     assert shown(page).shape == (480, 640, 3)
     ask_for(page, width="320", quality="40", fps="5")
-    house.until_streamed(COMPRESSED, width=320, height=240, quality=40, fps=5)
+    world.until_streamed(COMPRESSED, width=320, height=240, quality=40, fps=5)
     expect(part(page, "size")).to_have_text("320 × 240")
-    assert same_scene(shown(page), house.scene(width=320, quality=40))
+    assert same_scene(shown(page), world.scene(width=320, quality=40))
     ask_for(page, rotate="90")
-    turned = house.scene(width=320, quality=40, rotate=90)
-    house.until_streamed(COMPRESSED, width=320, height=turned.shape[0], quality=40, fps=5)
+    turned = world.scene(width=320, quality=40, rotate=90)
+    world.until_streamed(COMPRESSED, width=320, height=turned.shape[0], quality=40, fps=5)
     expect(part(page, "size")).to_have_text(f"320 × {turned.shape[0]}")
     assert same_scene(shown(page), turned)
     expect(part(page, "fps")).to_have_text(re.compile("^[45] fps$"))
     expect(part(page, "delay")).to_have_text(re.compile(r"^(< 1|\d+) ms old$"))
     expect(part(page, "bytes")).to_have_text(re.compile(r"^\d+ kB/s$"))
-    told = int(str(part(page, "bytes").text_content()).split()[0]) * 1000
-    size = len(house.snapshot(width=320, quality=40, rotate=90))
-    assert 2 * size < told < 8 * size
+    reported = int(str(part(page, "bytes").text_content()).split()[0]) * 1000
+    size = len(world.snapshot(width=320, quality=40, rotate=90))
+    assert 2 * size < reported < 8 * size
 
 
-def test_the_snapshot_is_a_jpeg_of_what_is_shown(house: House, open_page: OpenPage, tmp_path: Path) -> None:
-    """It is what the robot sees, of the size on the screen, and its name has the time it was taken."""
+def test_the_snapshot_is_a_jpeg_of_what_is_shown(world: World, open_page: OpenPage, tmp_path: Path) -> None:
+    """It shows the robot's view in the size on the screen, and its name has the capture time."""
     page = open_page()
-    with page.expect_download() as told:
+    with page.expect_download() as reported:
         part(page, "snapshot").click()
-    told.value.save_as(tmp_path / "snapshot")
+    reported.value.save_as(tmp_path / "snapshot")
     name = re.fullmatch(
-        r"rover-camera-image_raw-compressed-(.*)-(\d{3})Z\.jpg", told.value.suggested_filename
+        r"rover-camera-image_raw-compressed-(.*)-(\d{3})Z\.jpg", reported.value.suggested_filename
     )
     assert name
     taken = datetime.strptime(f"{name[1]}.{name[2]}+0000", "%Y-%m-%dT%H-%M-%S.%f%z")
     assert abs(time.time() - taken.timestamp()) < WAIT_SECONDS
     saved = (tmp_path / "snapshot").read_bytes()
     assert saved.startswith(b"\xff\xd8\xff")
-    assert same_scene(decoded(saved), house.scene())
+    assert same_scene(decoded(saved), world.scene())
 
 
-def test_two_cameras_side_by_side(house: House, open_page: OpenPage) -> None:
-    """Each is a stream of its own, and both go on."""
+def test_two_cameras_side_by_side(world: World, open_page: OpenPage) -> None:
+    """Each is a stream of its own, and both continue."""
     page = open_page()
     part(page, "add").click()
     panes = [pane(page, camera) for camera in (COMPRESSED, CAMERA)]
     for camera, each in zip((COMPRESSED, CAMERA), panes, strict=True):
         expect(part(each, "fps")).to_have_text(RUNS)
-        house.until_streamed(camera, viewers=1, width=640)
+        world.until_streamed(camera, viewers=1, width=640)
         goes_on(each)
-        assert same_scene(shown(each), house.scene())
+        assert same_scene(shown(each), world.scene())
     left, right = (each.bounding_box() for each in panes)
     assert left
     assert right
@@ -253,113 +259,113 @@ def test_two_cameras_side_by_side(house: House, open_page: OpenPage) -> None:
     assert left["x"] + left["width"] <= right["x"]
 
 
-def test_h264_is_shown(house: House, open_page: OpenPage) -> None:
-    """Decoded by the browser it is what the robot sees, and it goes on."""
+def test_h264_is_shown(world: World, open_page: OpenPage) -> None:
+    """The decoded frames show the robot's view, and continue."""
     page = open_page()
     ask_for(page, codec="h264")
-    house.until_streamed(COMPRESSED, codec="h264", width=640)
+    world.until_streamed(COMPRESSED, codec="h264", width=640)
     goes_on(page)
-    assert same_scene(shown(page), house.scene())
+    assert same_scene(shown(page), world.scene())
     expect(part(page, "fps")).to_have_text(RUNS)
     expect(part(page, "codec-note")).to_have_count(0)
 
 
-def test_h264_gives_way_to_jpeg_over_a_link_that_is_too_thin_for_it(house: House, browser: Browser) -> None:
-    """What comes of it now and then is no moving picture: after ten seconds the page asks for JPEG, and says why."""
-    proxy = ChaosProxy(house.relay.http_port)
+def test_h264_is_replaced_by_jpeg_over_a_link_that_is_too_slow_for_it(world: World, browser: Browser) -> None:
+    """After 10 s without smooth video the page asks for JPEG, and shows why."""
+    proxy = ChaosProxy(world.relay.http_port)
     try:
-        with sound_pages(browser, f"http://127.0.0.1:{proxy.port}", WAIT_SECONDS) as new_page:
+        with checked_pages(browser, f"http://127.0.0.1:{proxy.port}", WAIT_SECONDS) as new_page:
             page = in_cockpit(new_page(1280, 800))
             ask_for(page, codec="h264")
-            house.until_streamed(COMPRESSED, codec="h264", width=640)
+            world.until_streamed(COMPRESSED, codec="h264", width=640)
             proxy.squeeze_down(300_000)
             expect(part(page, "codec-note")).to_have_text(
-                "This link is too thin for H.264. JPEG is shown instead."
+                "This link is too slow for H.264. JPEG is shown instead."
             )
-            house.until_streamed(COMPRESSED, codec="jpeg")
+            world.until_streamed(COMPRESSED, codec="jpeg")
             proxy.squeeze_down(None)
             expect(part(page, "fps")).to_have_text(RUNS)
     finally:
         proxy.close()
 
 
-def test_a_browser_without_webcodecs_shows_jpeg_and_says_why(house: House, open_page: OpenPage) -> None:
-    """Though H.264 was chosen when it had a decoder."""
+def test_a_browser_without_webcodecs_shows_jpeg_with_the_reason(world: World, open_page: OpenPage) -> None:
+    """Though H.264 was chosen when a decoder was available."""
     page = open_page()
     ask_for(page, codec="h264")
-    house.until_streamed(COMPRESSED, codec="h264")
+    world.until_streamed(COMPRESSED, codec="h264")
     page.add_init_script("delete window.VideoDecoder")
     page.reload()
-    house.until_streamed(COMPRESSED, codec="jpeg")
+    world.until_streamed(COMPRESSED, codec="jpeg")
     goes_on(page)
     part(page, "settings").click()
     expect(part(page, "codec-note")).to_contain_text("This browser has no decoder for H.264 (WebCodecs).")
     expect(part(page, "ask-codec")).to_have_value("jpeg")
 
 
-def test_a_robot_without_pyav_shows_jpeg_and_says_why(house: House, open_page: OpenPage) -> None:
-    """Its own words are in the controls, and the picture goes on."""
-    (house.modules / "av.py").write_text("raise ImportError('there is no av here')")
+def test_a_robot_without_pyav_shows_jpeg_with_the_reason(world: World, open_page: OpenPage) -> None:
+    """The robot's reason is in the controls, and the video continues."""
+    (world.modules / "av.py").write_text("raise ImportError('there is no av here')")
     page = open_page()
-    # One that has imported it has it.
-    process = house.camera_process()
+    # A camera process that has imported PyAV keeps it.
+    process = world.camera_process()
     process.kill()
     wait_for("it is gone", lambda: gone(process))
     ask_for(page, codec="h264")
     try:
         words = re.compile("^H.264 needs PyAV.*JPEG is shown instead.$")
         expect(part(page, "codec-note")).to_have_text(words)
-        house.until_streamed(COMPRESSED, codec="jpeg")
+        world.until_streamed(COMPRESSED, codec="jpeg")
         goes_on(page)
     finally:
-        (house.modules / "av.py").unlink()
+        (world.modules / "av.py").unlink()
 
 
-def test_a_revoked_right_is_said_at_once_and_ends_the_stream(house: House, open_page: OpenPage) -> None:
-    """To view one of two cameras: its pane says why, and goes on saying it; the robot sends no
-    more of it; the other pane goes on; a new right brings the picture back.
+def test_a_revoked_right_is_shown_at_once_and_ends_the_stream(world: World, open_page: OpenPage) -> None:
+    """With two cameras: the pane of one shows the reason and keeps it, and the robot stops its stream. The
+    other pane continues; a new right restores the video.
     """
     page = open_page()
     part(page, "add").click()
     denied, left = pane(page, CAMERA), pane(page, COMPRESSED)
     goes_on(denied)
-    wait_for("the robot shows both and no others", lambda: house.links() == 2)
+    wait_for("the robot shows both and no others", lambda: world.links() == 2)
     listen(denied)
-    house.relay.cli("right", "grant", "watcher", "rover", "viewer", "--deny", f"view:{CAMERA}")
-    heard(page, REVOKED)
+    world.relay.cli("right", "grant", "watcher", "rover", "viewer", "--deny", f"view:{CAMERA}")
+    text_shown(page, REVOKED)
     last = shown(denied)
-    wait_for("the robot shows one", lambda: house.links() == 1)
+    wait_for("the robot shows one", lambda: world.links() == 1)
     goes_on(left)
-    # Until the page knows that there is no such camera for it.
+    # Until the page knows that the camera is not available.
     expect(part(left, "topic").locator(f"option[value='{CAMERA}']")).to_have_count(0)
     expect(part(denied, "words")).to_contain_text(REVOKED)
     assert np.array_equal(shown(denied), last)
-    house.relay.cli("right", "grant", "watcher", "rover", "viewer")
+    world.relay.cli("right", "grant", "watcher", "rover", "viewer")
     goes_on(denied)
     expect(part(denied, "words")).to_have_count(0)
 
 
-def test_pictures_come_back_when_the_camera_process_was_killed(house: House, open_page: OpenPage) -> None:
-    """The pane says since when there is none, and shows the next ones by itself."""
+def test_frames_come_back_when_the_camera_process_was_killed(world: World, open_page: OpenPage) -> None:
+    """The pane shows since when there is no frame, and continues by itself."""
     page = open_page()
     listen(pane(page, COMPRESSED))
-    process = house.camera_process()
+    process = world.camera_process()
     process.kill()
-    heard(page, "No picture since")
+    text_shown(page, "No frame for")
     goes_on(page, RESTART_SECONDS)
     expect(part(page, "stale")).to_have_count(0)
-    assert house.camera_process().pid != process.pid
+    assert world.camera_process().pid != process.pid
 
 
-def test_pictures_come_back_when_the_daemon_was_killed(house: House, open_page: OpenPage) -> None:
-    """Its camera process ends with it; started again it shows what was watched to those who still do."""
+def test_frames_come_back_when_the_daemon_was_killed(world: World, open_page: OpenPage) -> None:
+    """Its camera process ends with it; after a restart current viewers get their streams again."""
     page = open_page()
-    process = house.camera_process()
-    house.robot.daemon.kill()
+    process = world.camera_process()
+    world.robot.daemon.kill()
     wait_for("the camera process has ended", lambda: gone(process))
     expect(part(page, "words")).to_have_text("The robot is offline.")
-    expect(part(page, "stale")).to_have_text(re.compile(r"No picture since \d+ s"))
-    house.robot.start_daemon()
+    expect(part(page, "stale")).to_have_text(re.compile(r"No frame for \d+ s"))
+    world.robot.start_daemon()
     goes_on(page, RESTART_SECONDS)
     expect(part(page, "words")).to_have_count(0)
     expect(part(page, "fps")).to_have_text(RUNS)

@@ -1,4 +1,4 @@
-"""Clients that were not written for us: roslibpy and roslib.js, unmodified."""
+"""Third-party clients: roslibpy and roslib.js, unmodified."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_processes import ros_environment
+
+from tests.worlds.processes import ros_environment
 
 CLIENTS = Path(__file__).parent / "clients"
 ROOT = Path(__file__).parents[2]
@@ -24,18 +25,18 @@ def run(command: list[str], **options: Any) -> dict[str, Any]:
 
 
 def roslibpy(world: Any) -> dict[str, Any]:
-    """A whole visit with roslibpy."""
+    """A complete run of roslibpy."""
     return run([sys.executable, str(CLIENTS / "with_roslibpy.py"), world.relay.url("rover"), world.operator])
 
 
 def roslib(world: Any, url: str, token: str) -> dict[str, Any]:
-    """A whole visit with roslib.js in Node."""
+    """A complete run of roslib.js in Node."""
     node = [str(ROOT / "scripts" / "with-node.sh"), "node"]
     return run([*node, str(CLIENTS / "with_roslib.mjs"), str(ROSLIB), url, token])
 
 
 def saw_everything(seen: dict[str, Any]) -> None:
-    """What any client must have seen."""
+    """The results that every client must have."""
     assert {"/scan", "/odom", "/cmd_vel", "/battery_state"} <= set(seen["topics"])
     assert "/reset" in seen["services"]
     assert seen["scan_type"] == "sensor_msgs/msg/LaserScan"
@@ -46,17 +47,17 @@ def saw_everything(seen: dict[str, Any]) -> None:
 
 
 def test_roslibpy_lists_watches_drives_and_calls(world: Any) -> None:
-    """roslibpy with a Bearer header does all of its daily work."""
+    """roslibpy with a Bearer header does all common operations."""
     saw_everything(roslibpy(world))
 
 
 def test_roslib_js_with_the_auth_operation(world: Any) -> None:
-    """roslib.js proves itself by ``ros.authenticate`` with the access token."""
+    """roslib.js authenticates by ``ros.authenticate`` with the access token."""
     saw_everything(roslib(world, world.relay.url("rover"), world.operator))
 
 
 def test_roslib_js_with_a_ticket(world: Any) -> None:
-    """roslib.js comes in by a single-use ticket in the URL, and nobody does a second time."""
+    """roslib.js connects by a single-use ticket in the URL; a second use fails."""
     request = urllib.request.Request(
         f"http://127.0.0.1:{world.relay.http_port}/api/v1/tickets",
         json.dumps({"robot": "rover"}).encode(),
@@ -72,7 +73,7 @@ def test_roslib_js_with_a_ticket(world: Any) -> None:
 
 
 def test_three_clients_share_one_subscription_on_the_robot(world: Any) -> None:
-    """However many watch, the robot has one subscription of ours; it ends when the last client goes."""
+    """For any number of clients the relay has one subscription on the robot; it ends with the last client."""
     counter = [sys.executable, str(CLIENTS / "subscriptions_of.py"), "/odom"]
     clients = [world.relay.connect("rover", token) for token in (world.operator, world.viewer, world.viewer)]
     try:

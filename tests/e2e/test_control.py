@@ -1,4 +1,4 @@
-"""Several people share a robot: one moves it, everybody may stop it, and no failure takes a stop back."""
+"""Several users share a robot: one moves it, all may stop it, and no failure reverts a stop."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_drive import LATE_MS
-from switchboard_http import Answer, ask
-from switchboard_pulse import Pulse
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
+
+from tests.worlds.driving import LATE_MS
+from tests.worlds.http_requests import Answer, ask
+from tests.worlds.machine_pauses import Pulse
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 CLIENTS = Path(__file__).parent / "clients"
 LET_GO_SECONDS = 0.8
@@ -28,11 +29,11 @@ PAUSE = 0.3
 """Who has said nothing for so many seconds, as far as he knows, may have let go as far as the robot knows."""
 LEVELS = {"olga": "owner", "ann": "operator", "bob": "operator", "vic": "viewer"}
 
-MOMENT = "switchboard-moment"
+MOMENT = "switchboard-freshness"
 
 
-class Place:
-    """A relay with a robot and four people."""
+class ControlWorld:
+    """A relay with a robot and four users."""
 
     def __init__(self, folder: Path) -> None:
         self.relay = Relay(folder, "--heartbeat", "0.5")
@@ -44,7 +45,7 @@ class Place:
             self.relay.cli("right", "grant", name, "rover", level)
 
     def connect(self, name: str) -> Client:
-        """A connection of one of them, who hears of errors."""
+        """A user's connection that receives errors."""
         client = self.relay.connect("rover", self.tokens[name])
         client.send(op="set_level", level="error")
         return client
@@ -56,21 +57,21 @@ class Place:
         return ask(self.relay.http_port, method, path, body, headers=dated, token=token)
 
     def control(self, name: str = "olga") -> dict[str, Any]:
-        """Who moves the robot."""
+        """The robot's control."""
         return dict(self.http("GET", "control", name).json)
 
     def moves(self) -> None:
-        """Wait until the robot moves, by its own record."""
+        """Waits until the robot moves, by its own log."""
         wait_for("the robot moves", self.robot.moving)
 
     def stands(self) -> None:
-        """Wait until it stands."""
+        """Waits until it stands."""
         wait_for("the robot stands", lambda: not self.robot.moving())
 
     @contextmanager
     def driving(self, name: str, v: float = 0.2) -> Iterator[Client]:
-        """Somebody who has let go drives, at 20 Hz, and hears nothing meanwhile; see :attr:`pause`."""
-        time.sleep(LET_GO_SECONDS)  # so long he must say nothing
+        """A user drives at 20 Hz after a pause, without reading; see :attr:`pause`."""
+        time.sleep(LET_GO_SECONDS)  # a pause this long counts as a release
         with self.connect(name) as client:
             client.send(op="set_level", level="none")
             end = threading.Event()
@@ -91,26 +92,27 @@ class Place:
                 thread.join(10)
 
     def stop(self) -> None:
-        """End everything."""
         self.robot.stop()
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """One for all: each test leaves the robot free, and not stopped."""
-    place = Place(tmp_path_factory.mktemp("control"))
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlWorld]:
+    """One for all: each test leaves the robot without a controller and not stopped."""
+    scene = ControlWorld(tmp_path_factory.mktemp("control"))
     try:
-        yield place
+        yield scene
     finally:
-        place.stop()
+        scene.stop()
 
 
-def test_two_roslibpy_users_hand_a_robot_over(place: Place) -> None:
-    """The first drives without a word about control; the second asks, gets it, and only he moves the robot."""
+def test_handover_between_two_roslibpy_users(scene: ControlWorld) -> None:
+    """The first drives without asking for control; the second requests it, gets it, and only the second moves
+    the robot.
+    """
     program = [sys.executable, str(CLIENTS / "handing_over_with_roslibpy.py")]
     done = subprocess.run(
-        [*program, place.relay.url("rover"), place.tokens["ann"], place.tokens["bob"]],
+        [*program, scene.relay.url("rover"), scene.tokens["ann"], scene.tokens["bob"]],
         capture_output=True,
         text=True,
         timeout=120,
@@ -121,12 +123,16 @@ def test_two_roslibpy_users_hand_a_robot_over(place: Place) -> None:
     assert all(seen[what] for what in ("free", "held", "requested", "handed over"))
     assert seen["asked"] == {"success": False, "message": "ann has control and was asked for it"}
     assert (seen["granted"]["success"], seen["released"]["success"]) == (True, True)
-    after = [each["v"] for each in place.robot.events("command", seen["since"]) if each["v"]]
+    after = [each["v"] for each in scene.robot.events("command", seen["since"]) if each["v"]]
     assert after
     assert all(v < 0 for v in after), "the first moved it after he had handed it over"
-    actions = [entry["action"] for entry in place.relay.cli("audit", "list")]
-    in_order = [action for action in actions if action.startswith("control.")]
-    assert in_order[:5] == [
+
+    def first_actions() -> list[str]:
+        actions = [entry["action"] for entry in scene.relay.cli("audit", "list")]
+        return [action for action in actions if action.startswith("control.")][:5]
+
+    wait_for("all is in the audit log", lambda: len(first_actions()) == 5)
+    assert first_actions() == [
         "control.taken",
         "control.requested",
         "control.granted",
@@ -135,157 +141,159 @@ def test_two_roslibpy_users_hand_a_robot_over(place: Place) -> None:
     ]
 
 
-def test_who_never_let_go_moves_nothing_by_taking_control_again(place: Place) -> None:
-    """An owner takes control from who drives; he holds on, takes it back, and the robot stands until he lets go."""
-    with place.driving("ann") as ann:
+def test_taking_control_again_without_a_release_moves_nothing(scene: ControlWorld) -> None:
+    """An owner takes control from a driver who goes on commanding, and takes it back: the robot stands until
+    the driver pauses.
+    """
+    with scene.driving("ann") as ann:
 
         def holds_on() -> bool:
-            place.moves()
-            place.pause = 0.0
-            assert place.http("POST", "control/release", "olga", {"why": "a rest"}).status == 200
-            place.stands()
-            time.sleep(LET_GO_SECONDS)  # to the robot, which hears nothing of him, that is silence
+            scene.moves()
+            scene.pause = 0.0
+            assert scene.http("POST", "control/release", "olga", {"why": "a rest"}).status == 200
+            scene.stands()
+            time.sleep(LET_GO_SECONDS)  # the robot receives none of these commands, so for it this is a pause
             assert ann.call("/relay/take_control")["values"]["success"]
-            assert place.control("ann")["holder"]["user"] == "ann"
-            time.sleep(0.3)  # he still holds the stick: nothing may come of it
-            moved = place.robot.moving()
-            if moved and place.pause >= PAUSE:
+            assert scene.control("ann")["holder"]["user"] == "ann"
+            time.sleep(0.3)  # shows absence: the commands go on without effect
+            moved = scene.robot.moving()
+            if moved and scene.pause >= PAUSE:
                 return False
             assert not moved
             return True
 
         wait_for("he says nothing for no moment", holds_on)
         ann.drive(0.0)
-        place.moves()
-    place.stands()
+        scene.moves()
+    scene.stands()
 
 
-def test_a_viewer_stops_who_drives_and_may_not_resume(place: Place) -> None:
-    """The robot stands at once and stays so; who holds control lets it move again, once he has let go."""
-    with place.driving("ann") as ann, place.connect("vic") as vic, Pulse() as pulse:
-        place.moves()
+def test_a_viewer_stops_the_driver_and_may_not_resume(scene: ControlWorld) -> None:
+    """The robot stands at once and stays stopped; the controller resumes it, and moves it after a pause."""
+    with scene.driving("ann") as ann, scene.connect("vic") as vic, Pulse() as pulse:
+        scene.moves()
         since = time.monotonic_ns()
         assert vic.call("/relay/stop", {"why": "somebody is in the way"})["values"]["success"]
-        place.stands()
-        took_ms = (place.robot.events("standstill", since)[0]["t"] - since) / 1e6
+        scene.stands()
+        took_ms = (scene.robot.events("standstill", since)[0]["t"] - since) / 1e6
         assert took_ms < LATE_MS + 1000 * pulse.lost()
         refused = vic.call("/relay/resume")
         assert refused["result"] is False
-        assert "only who has control" in refused["values"]
-        assert place.http("POST", "resume", "bob").status == 403
-        stopped = place.control("vic")["stopped"]
-        assert (stopped["by"], stopped["why"], stopped["told"]) == ("vic", "somebody is in the way", True)
-        assert place.control("ann")["holder"]["user"] == "ann"
+        assert "only the holder of control" in refused["values"]
+        assert scene.http("POST", "resume", "bob").status == 403
+        stopped = scene.control("vic")["stopped"]
+        assert (stopped["by"], stopped["why"], stopped["confirmed"]) == (
+            "vic",
+            "somebody is in the way",
+            True,
+        )
+        assert scene.control("ann")["holder"]["user"] == "ann"
         wait_for(
             "she may say so after the stop",
             lambda: ann.call("/relay/resume", {"why": "he is gone"})["result"],
         )
-        assert place.control("ann")["stopped"] is None
+        assert scene.control("ann")["stopped"] is None
         assert vic.call("/relay/ping", {"robot": True})["result"]
-        time.sleep(0.3)  # he still holds the stick: nothing may come of it
-        assert not place.robot.moving()
-    with place.driving("ann"):
-        place.moves()
-    place.stands()
+        time.sleep(0.3)  # shows absence: the commands go on without effect
+        assert not scene.robot.moving()
+    with scene.driving("ann"):
+        scene.moves()
+    scene.stands()
 
 
-def test_a_stop_survives_the_relay_and_the_daemon(place: Place) -> None:
+def test_a_stop_survives_the_relay_and_the_daemon(scene: ControlWorld) -> None:
     """kill -9 of both: the robot comes back stopped, and an owner resumes it."""
-    with place.driving("ann"):
-        place.moves()
-        assert place.http("POST", "stop", "vic", {"why": "smoke"}).status == 200
-    place.stands()
-    place.relay.kill()
-    place.robot.daemon.kill()
-    place.relay.start()
-    place.robot.start_daemon()
-    place.robot.wait_online()
-    wait_for("it tells that it is stopped", lambda: place.control()["stopped"])
-    assert place.control()["stopped"]["why"] == "smoke"
+    with scene.driving("ann"):
+        scene.moves()
+        assert scene.http("POST", "stop", "vic", {"why": "smoke"}).status == 200
+    scene.stands()
+    scene.relay.kill()
+    scene.robot.daemon.kill()
+    scene.relay.start()
+    scene.robot.start_daemon()
+    scene.robot.wait_online()
+    wait_for("it reports that it is stopped", lambda: scene.control()["stopped"])
+    assert scene.control()["stopped"]["why"] == "smoke"
     since = time.monotonic_ns()
-    with place.driving("ann"):
-        wait_for("he has control", lambda: place.control()["holder"])
-        time.sleep(0.5)  # he drives on: nothing may come of it
-    assert not [each for each in place.robot.events("command", since) if each["v"]]
-    assert place.http("POST", "resume", "olga", {"why": "it was toast"}).json == {"stopped": None}
-    with place.driving("ann"):
-        place.moves()
-    place.stands()
+    with scene.driving("ann"):
+        wait_for("he has control", lambda: scene.control()["holder"])
+        time.sleep(0.5)  # shows absence: the commands go on without effect
+    assert not [each for each in scene.robot.events("command", since) if each["v"]]
+    assert scene.http("POST", "resume", "olga", {"why": "it was toast"}).json == {"stopped": None}
+    with scene.driving("ann"):
+        scene.moves()
+    scene.stands()
 
 
-def test_a_robot_that_is_away_is_stopped_when_it_comes_back(place: Place) -> None:
-    """By the command line, also when no relay runs; before anybody can drive it."""
-    place.robot.daemon.stop()
-    wait_for("the robot is offline", lambda: place.relay.state_of("rover") == "offline")
-    assert place.relay.cli("stop", "rover", "--why", "maintenance") == {
-        "robots": [{"robot": "rover", "done": False}]
-    }
-    assert place.control()["stopped"]["told"] is False
-    assert place.http("POST", "stop", "vic").status == 202
-    place.relay.cli("resume", "rover")
-    assert place.control()["stopped"] is None
-    place.relay.stop()
-    assert place.relay.cli("stop", "--all") == {"robots": [{"robot": "rover", "done": False}]}
-    place.relay.start()
-    assert place.control()["stopped"]["told"] is False
-    place.robot.start_daemon()
-    place.robot.wait_online()
-    wait_for("it has confirmed it", lambda: place.control()["stopped"]["told"])
-    shown = ask(place.relay.http_port, "GET", "/api/v1/robots", token=place.tokens["vic"]).json["robots"][0]
-    assert shown["stopped"]["told"] is True
-    assert "may move again" in place.relay.run_cli("resume", "rover").stdout
-    assert place.control()["stopped"] is None
+def test_a_robot_that_is_away_is_stopped_when_it_comes_back(scene: ControlWorld) -> None:
+    """By the command line, even without a running relay; the stop comes before any command."""
+    scene.robot.daemon.stop()
+    wait_for("the robot is offline", lambda: scene.relay.state_of("rover") == "offline")
+    (answer,) = scene.relay.cli("stop", "rover", "--why", "maintenance")["robots"]
+    assert (answer["robot"], answer["done"], answer["stopped"]["why"]) == ("rover", False, "maintenance")
+    assert scene.control()["stopped"]["confirmed"] is False
+    assert scene.http("POST", "stop", "vic").status == 202
+    scene.relay.cli("resume", "rover")
+    assert scene.control()["stopped"] is None
+    scene.relay.stop()
+    assert scene.relay.cli("stop", "--all") == {"robots": [{"robot": "rover", "done": False}]}
+    scene.relay.start()
+    assert scene.control()["stopped"]["confirmed"] is False
+    scene.robot.start_daemon()
+    scene.robot.wait_online()
+    wait_for("it has confirmed it", lambda: scene.control()["stopped"]["confirmed"])
+    shown = ask(scene.relay.http_port, "GET", "/api/v1/robots", token=scene.tokens["vic"]).json["robots"][0]
+    assert shown["stopped"]["confirmed"] is True
+    assert "may move again" in scene.relay.run_cli("resume", "rover").stdout
+    assert scene.control()["stopped"] is None
 
 
-def test_a_right_that_is_revoked_ends_control(place: Place) -> None:
-    """The robot stands, and somebody else takes it."""
-    with place.driving("bob"):
-        place.moves()
-        place.relay.cli("right", "grant", "bob", "rover", "viewer")
-        place.stands()
-        with place.driving("ann"):
-            place.moves()
-            assert place.control()["holder"]["user"] == "ann"
-    place.relay.cli("right", "grant", "bob", "rover", "operator")
-    place.stands()
+def test_a_right_that_is_revoked_ends_control(scene: ControlWorld) -> None:
+    """The robot stands, and another user takes control."""
+    with scene.driving("bob"):
+        scene.moves()
+        scene.relay.cli("right", "grant", "bob", "rover", "viewer")
+        scene.stands()
+        with scene.driving("ann"):
+            scene.moves()
+            assert scene.control()["holder"]["user"] == "ann"
+    scene.relay.cli("right", "grant", "bob", "rover", "operator")
+    scene.stands()
 
 
-def test_an_owner_suppresses_who_drives(place: Place) -> None:
-    """For as long as it is renewed only he moves the robot; then it is the driver's again, once he has let go."""
-    with place.driving("ann", 0.2), place.connect("olga") as olga:
-        place.moves()
+def test_an_owner_suppresses_the_driver(scene: ControlWorld) -> None:
+    """While it is renewed only the owner moves the robot; after that the driver does, following a pause."""
+    with scene.driving("ann", 0.2), scene.connect("olga") as olga:
+        scene.moves()
 
         def suppressed() -> bool:
             since = 0
-            with Pulse() as pulse:
-                for renewal in range(20):
-                    if renewal == 4:
-                        since = time.monotonic_ns()
-                    order = {"resource": "/cmd_vel", "ms": 200}
-                    olga.send(op="call_service", service="/relay/suppress", args=order)
-                    olga.drive(-0.1)
-                    time.sleep(0.05)  # the pace of a driver
-                commands = [each["v"] for each in place.robot.events("command", since)]
-                if pulse.lost():
-                    return False
-            assert min(commands) < 0
-            assert max(commands) <= 0, "the driver's commands came through"
-            return True
+            for renewal in range(24):
+                if renewal == 4:
+                    since = time.monotonic_ns()
+                order = {"resource": "/cmd_vel", "ms": 200}
+                olga.send(op="call_service", service="/relay/suppress", args=order)
+                olga.drive(-0.1)
+                time.sleep(0.05)  # the driver's rate
+            commands = [each["v"] for each in scene.robot.events("command", since)]
+            # Suppression ends after 200 ms: a pause of this process or of the relay lets the driver's
+            # commands through.
+            return min(commands) < 0 and max(commands) <= 0
 
-        wait_for("it is renewed without a pause", suppressed)
-        assert place.control()["holder"]["user"] == "ann"
-    place.stands()
+        wait_for("a second passes without a command of the driver", suppressed)
+        assert scene.control()["holder"]["user"] == "ann"
+    scene.stands()
 
 
-def test_an_inhibited_topic_says_nothing(place: Place) -> None:
-    """To anybody, for so long; it takes the right to."""
-    with place.connect("vic") as vic:
+def test_an_inhibited_topic_sends_nothing(scene: ControlWorld) -> None:
+    """For all clients during the given time; it needs the right."""
+    with scene.connect("vic") as vic:
         vic.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
         vic.until(op="publish", topic="/odom")
-        assert place.http("POST", "inhibit", "ann", {"resource": "/odom"}).status == 403
+        assert scene.http("POST", "inhibit", "ann", {"resource": "/odom"}).status == 403
         begun = time.monotonic()
-        assert place.http("POST", "inhibit", "olga", {"resource": "/odom", "ms": 1500}).status == 200
+        assert scene.http("POST", "inhibit", "olga", {"resource": "/odom", "ms": 1500}).status == 200
         assert vic.call("/relay/ping", {"robot": True})["result"]
         vic.until(op="publish", topic="/odom")
         assert time.monotonic() - begun > 1.4
-        assert [each["resource"] for each in place.control("vic")["inhibited"]] == []
+        assert [each["resource"] for each in scene.control("vic")["inhibited"]] == []

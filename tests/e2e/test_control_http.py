@@ -1,4 +1,6 @@
-"""Control over HTTP alone, with a real relay and a real ROS 2 robot: taken, used, asked for, given back and lost."""
+"""Control over HTTP only, with a real relay and a real ROS 2 robot: taken, used, requested, released and
+lost.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,12 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_drive import LET_GO_SECONDS
-from switchboard_http import ask
-from switchboard_waiting import wait_for
 
 from relay_server.common.freshness_tokens import HEADER
-from relay_server.http_sessions.pool import LINGER_SECONDS
+from relay_server.in_process_sessions.pool import LINGER_SECONDS
+from tests.worlds.driving import LET_GO_SECONDS
+from tests.worlds.http_requests import ask
+from tests.worlds.waiting import wait_for
 
 ROBOT = "/api/v1/robots/rover"
 STAND: Any = {"value": {}}
@@ -27,10 +29,10 @@ def client_of(world: Any, token: str) -> httpx.Client:
     return httpx.Client(base_url=base, headers=headers, timeout=90)
 
 
-class Hand:
-    """Somebody who moves the robot by requests alone, and gives back the moment of the latest answer.
+class HttpOperator:
+    """A user who moves the robot by requests only, with the freshness token of the latest answer.
 
-    :param token: his
+    :param token: the user's
     """
 
     def __init__(self, world: Any, token: str) -> None:
@@ -39,34 +41,34 @@ class Hand:
         self.client = client_of(world, token)
 
     def take(self, why: str = "", **headers: str) -> httpx.Response:
-        """Take control, or ask for it."""
+        """Takes or requests control."""
         return self._dated(self.client.put("control", json={"why": why}, headers=headers))
 
     def drive(self, command: Any = GO) -> httpx.Response:
-        """One command."""
+        """Sends one command."""
         return self._dated(self.client.post("topics/cmd_vel", json=command, headers={HEADER: self._moment}))
 
     def moves(self) -> None:
-        """Drive until the robot moves, by its own record."""
+        """Drives until the robot moves, by its own log."""
 
         def moving() -> bool:
             answer = self.drive()
-            # On a slow machine the moment of the latest answer is too old at times, or the robot is not ready in time.
+            # On a slow machine the latest token may be too old, or the robot not ready in time.
             assert answer.status_code in (204, 409, 412), answer.text
             return bool(self._world.robot.moving())
 
         wait_for("the robot moves", moving)
 
     def stands(self) -> None:
-        """Wait until it stands."""
+        """Waits until it stands."""
         wait_for("the robot stands", lambda: not self._world.robot.moving())
 
     def control(self) -> dict[str, Any]:
-        """Who moves it. By asking for that no connection is kept."""
+        """The robot's control. Reading it does not keep a connection open."""
         return dict(self.client.get("control").json())
 
     def holder(self) -> str | None:
-        """The user who has control."""
+        """The controller's name."""
         found = self.control()["holder"]
         return None if found is None else str(found["user"])
 
@@ -77,7 +79,7 @@ class Hand:
 
 @pytest.fixture
 def tokens(world: Any) -> Iterator[dict[str, str]]:
-    """Of two who may drive; the robot is free before and after."""
+    """Tokens of two operators; the robot has no controller before and after."""
     found = {}
     for name in ("hal", "ida"):
         known = name in [each["user"] for each in world.relay.cli("user", "list")]
@@ -92,16 +94,16 @@ def tokens(world: Any) -> Iterator[dict[str, str]]:
 
 
 @pytest.fixture
-def hal(world: Any, tokens: dict[str, str]) -> Iterator[Hand]:
-    """Who moves the robot by HTTP, and has let go."""
-    hand = Hand(world, tokens["hal"])
-    time.sleep(LET_GO_SECONDS)  # so long he must have said nothing
-    yield hand
-    hand.client.close()
+def hal(world: Any, tokens: dict[str, str]) -> Iterator[HttpOperator]:
+    """A user who moves the robot by HTTP, after a pause."""
+    operator_ = HttpOperator(world, tokens["hal"])
+    time.sleep(LET_GO_SECONDS)  # a pause this long counts as a release
+    yield operator_
+    operator_.client.close()
 
 
-def test_who_takes_control_drives(hal: Hand) -> None:
-    """By commands to a topic with the same token; what he gives back stops the robot."""
+def test_taking_control_allows_driving(hal: HttpOperator) -> None:
+    """By messages to a topic with the same token; releasing stops the robot."""
     taken = hal.take("delivery")
     assert (taken.status_code, taken.json()["success"], taken.json()["kept"]) == (200, True, LINGER_SECONDS)
     holder = taken.json()["control"]["holder"]
@@ -115,18 +117,22 @@ def test_who_takes_control_drives(hal: Hand) -> None:
     assert hal.client.delete("control").status_code == 204
 
 
-def test_another_asks_and_is_granted(world: Any, tokens: dict[str, str], hal: Hand) -> None:
-    """He sees who asks by taking control again; what he sends after he has granted it moves nothing."""
+def test_another_asks_and_is_granted(world: Any, tokens: dict[str, str], hal: HttpOperator) -> None:
+    """The controller sees the request in the answer to a repeated take; after granting it their commands have
+    no effect.
+    """
     with world.relay.connect("rover", tokens["ida"]) as ida:
 
         def asks() -> str | None:
-            """What she is told, unless the machine stood still for so long that he has lost control."""
+            """The error that the requester gets, or None if the controller lost control because the machine
+            was slow.
+            """
             assert hal.take().status_code == 200
             hal.moves()
-            told = ida.call("/relay/take_control", {"why": "my turn"})["values"]
-            if told["success"]:
+            reported = ida.call("/relay/take_control", {"why": "my turn"})["values"]
+            if reported["success"]:
                 ida.call("/relay/release_control")
-            return None if told["success"] else str(told["message"])
+            return None if reported["success"] else str(reported["message"])
 
         assert "hal has control" in wait_for("ida asks", asks)
         request = hal.take().json()["control"]["request"]
@@ -137,14 +143,14 @@ def test_another_asks_and_is_granted(world: Any, tokens: dict[str, str], hal: Ha
         assert hal.take("again").status_code == 202
         refused = hal.drive()
         assert refused.status_code in (403, 412), refused.text
-        # Where the machine was so slow that it came too late, that is told first.
+        # On a slow machine the error about lateness comes first.
         assert refused.status_code == 412 or "controlled by ida" in refused.json()["detail"]
         assert not world.robot.moving()
         assert ida.call("/relay/release_control")["values"]["success"]
 
 
-def test_who_asks_waits_for_the_answer(world: Any, tokens: dict[str, str], hal: Hand) -> None:
-    """As long as he prefers: it is granted, or refused in words; what is not answered stays a request."""
+def test_request_waits_for_the_answer(world: Any, tokens: dict[str, str], hal: HttpOperator) -> None:
+    """For the preferred time: it is granted, or refused with a reason; an unanswered one stays."""
     with world.relay.connect("rover", tokens["ida"]) as ida, ThreadPoolExecutor(1) as pool:
         assert ida.call("/relay/take_control")["values"]["success"]
         pending = hal.take("delivery", Prefer="wait=0.2")
@@ -162,33 +168,37 @@ def test_who_asks_waits_for_the_answer(world: Any, tokens: dict[str, str], hal: 
         assert ida.call("/relay/refuse_control")["values"]["success"]
         refused = waiting.result(60)
         assert (refused.status_code, refused.json()["code"]) == (409, "not_done")
-        assert "your request for control is over" in refused.json()["detail"]
+        assert "your request for control has ended" in refused.json()["detail"]
 
 
-def test_who_falls_silent_loses_it(hal: Hand, world: Any, tokens: dict[str, str]) -> None:
-    """The robot stands by its own watch; later nobody has control, which is told, and whoever comes has it."""
+def test_silent_controller_loses_control(hal: HttpOperator, world: Any, tokens: dict[str, str]) -> None:
+    """The watchdog stops the robot; later the loss is reported, and any client may take control."""
     assert hal.take().status_code == 200
     hal.moves()
     hal.stands()
-    # Asking who has it does not keep it.
+    # Reading the controller does not extend control.
     wait_for("nobody has control", lambda: hal.holder() is None)
-    lost = [each for each in world.relay.cli("audit", "list") if each["action"] == "control.lost"]
-    assert any(each["data"]["why"] == "the connection has ended" for each in lost)
+
+    def reasons() -> list[str]:
+        entries = world.relay.cli("audit", "list")
+        return [each["data"]["why"] for each in entries if each["action"] == "control.lost"]
+
+    wait_for("the loss is in the audit log", lambda: "the connection has ended" in reasons())
     assert not world.robot.moving()
 
-    def told() -> list[str]:
-        """Alerts of control that was lost by somebody who had not let go."""
+    def reported() -> list[str]:
+        """Alerts about control lost without a release."""
         found = ask(world.relay.http_port, "GET", "/api/v1/alerts?robot=rover&open=true", token=tokens["hal"])
         return [each["text"] for each in found.json["alerts"] if each["kind"] == "control"]
 
-    (text,) = wait_for("it is told", told)
+    (text,) = wait_for("it is told", reported)
     assert text.startswith("hal lost control while")
     assert hal.take().status_code == 200
-    wait_for("somebody has control again", lambda: not told())
+    wait_for("somebody has control again", lambda: not reported())
 
 
-def test_who_has_said_zero_is_no_matter_of_an_alert(hal: Hand, world: Any, tokens: dict[str, str]) -> None:
-    """He has let go; that his control ends with his silence is as it should be."""
+def test_zero_velocity_raises_no_alert(hal: HttpOperator, world: Any, tokens: dict[str, str]) -> None:
+    """Zero counts as a release, so the end of control by silence is normal."""
     assert hal.take().status_code == 200
     hal.moves()
     wait_for("zero is said", lambda: hal.drive(STAND).status_code == 204)
@@ -197,10 +207,10 @@ def test_who_has_said_zero_is_no_matter_of_an_alert(hal: Hand, world: Any, token
     assert [each for each in found.json["alerts"] if each["kind"] == "control"] == []
 
 
-def test_a_revoked_token_loses_it(world: Any, tokens: dict[str, str], hal: Hand) -> None:
-    """While he drives: the robot stands, nobody has control, and he is nobody."""
+def test_a_revoked_token_loses_it(world: Any, tokens: dict[str, str], hal: HttpOperator) -> None:
+    """The robot stops during the drive, has no controller, and the token is invalid."""
     before = {each["id"] for each in world.relay.cli("token", "list")}
-    revoked = Hand(world, world.relay.token("hal"))
+    revoked = HttpOperator(world, world.relay.token("hal"))
     (number,) = {each["id"] for each in world.relay.cli("token", "list")} - before
     assert revoked.take().status_code == 200
     revoked.moves()
@@ -211,12 +221,12 @@ def test_a_revoked_token_loses_it(world: Any, tokens: dict[str, str], hal: Hand)
     revoked.client.close()
 
 
-def test_only_who_may_control_takes_it(world: Any, tokens: dict[str, str], hal: Hand) -> None:
-    """A viewer is refused in words, a stranger is told of no robot, and who proves nobody of nothing."""
+def test_taking_control_needs_the_right(world: Any, tokens: dict[str, str], hal: HttpOperator) -> None:
+    """A viewer gets a reason, a user without rights gets 404, and an unauthenticated client 401."""
     for token, status in ((world.viewer, 403), (world.stranger, 404), ("nobody", 401)):
-        hand = Hand(world, token)
+        operator_ = HttpOperator(world, token)
         for method, expected in (("PUT", status), ("DELETE", 204 if status == 403 else status)):
-            answer = hand.client.request(method, "control")
+            answer = operator_.client.request(method, "control")
             assert answer.status_code == expected, answer.text
-        hand.client.close()
+        operator_.client.close()
     assert hal.holder() is None

@@ -1,4 +1,4 @@
-"""A robot of ROS 2 holds to its stop, whatever becomes of its daemon and of the relay."""
+"""A ROS 2 robot keeps its stop when its daemon or the relay fail."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from switchboard_drive import Drive
-from switchboard_threads import Driver
-from switchboard_waiting import wait_for
+
+from tests.worlds.client_threads import Driver
+from tests.worlds.driving import Drive
+from tests.worlds.waiting import wait_for
 
 
 @pytest.fixture
@@ -23,7 +24,9 @@ def drive(tmp_path: Path) -> Iterator[Drive]:
 
 
 def test_stop_outlives_a_killed_daemon_and_a_killed_relay(drive: Drive) -> None:
-    """kill -9 of the daemon, then of the relay too: who drives on moves nothing until the robot is resumed."""
+    """kill -9 of the daemon, then of the relay too: continued commands move nothing until the robot is
+    resumed.
+    """
     driver = drive.start_driving()
     stopped = drive.relay.cli("stop", "rover", "--why", "a child on the floor")
     assert stopped is not None
@@ -38,10 +41,10 @@ def test_stop_outlives_a_killed_daemon_and_a_killed_relay(drive: Drive) -> None:
     another = Driver(drive.relay.connect_by(drive.client_side.port, "rover", drive.token))
     another.start()
     try:
-        time.sleep(3)  # a guard and a channel are there within that time
+        time.sleep(3)  # guard and channel are ready within that time
         assert [each for each in drive.robot.events("command", since) if each["v"] or each["w"]] == []
         drive.relay.cli("resume", "rover")
-        time.sleep(1)  # his stream goes on without a pause
+        time.sleep(1)  # the commands go on without a pause
         assert [each for each in drive.robot.events("command", since) if each["v"] or each["w"]] == []
     finally:
         another.stop()

@@ -1,4 +1,4 @@
-"""The directory, with a real relay, a real ROS 2 robot, httpx and curl."""
+"""The service registry, with a real relay, a real ROS 2 robot, httpx and curl."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_processes import ros_environment, running
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import PATIENCE, wait_for
 
 from tests.robot_client.ros import Peer
+from tests.worlds.processes import ros_environment, running
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.waiting import PATIENCE, wait_for
 
 DIRECTORY = "/api/v1/directory"
 MAP = {"kind": "application", "name": "map", "address": "http://10.0.0.7:8000/"}
@@ -44,14 +44,14 @@ def found(client: httpx.Client, **query: str) -> list[dict[str, Any]]:
 
 @pytest.fixture
 def relay(tmp_path: Path) -> Iterator[Relay]:
-    """A relay of its own, which may be killed."""
+    """A new relay that the test may kill."""
     running = Relay(tmp_path)
     yield running
     running.stop()
 
 
 def test_leases_outlast_a_relay_that_is_killed_and_end_at_their_time(relay: Relay) -> None:
-    """What is not renewed is gone, and that is remembered; its program registers anew."""
+    """An entry that is not renewed ends with an event; its program registers again."""
     with client_of(relay, relay.user("root", admin=True)) as client:
         long = client.post(DIRECTORY, json={**MAP, "ttl": 3600})
         assert long.status_code == 201
@@ -76,10 +76,10 @@ def test_leases_outlast_a_relay_that_is_killed_and_end_at_their_time(relay: Rela
 
 
 class Reader:
-    """Follows the directory in a thread until so many changes have come."""
+    """Follows the service registry in a thread until it has this many changes."""
 
     def __init__(self, client: httpx.Client, count: int) -> None:
-        self.told: list[tuple[str, str]] = []
+        self.reported: list[tuple[str, str]] = []
         self.open = threading.Event()
         self._client = client
         self._count = count
@@ -94,19 +94,19 @@ class Reader:
                 if line.startswith("event: "):
                     event = line.removeprefix("event: ")
                 if line.startswith("data: "):
-                    self.told.append((event, json.loads(line.removeprefix("data: "))["name"]))
-                if len(self.told) == self._count:
+                    self.reported.append((event, json.loads(line.removeprefix("data: "))["name"]))
+                if len(self.reported) == self._count:
                     return
 
     def all(self) -> list[tuple[str, str]]:
-        """All that were wanted."""
-        wait_for(f"{self._count} changes come", lambda: len(self.told) == self._count)
+        """All expected changes."""
+        wait_for(f"{self._count} changes come", lambda: len(self.reported) == self._count)
         self._thread.join(PATIENCE)
-        return self.told
+        return self.reported
 
 
-def test_who_follows_hears_what_comes_and_goes(relay: Relay) -> None:
-    """Whoever removes it: its program, or the administrator by the command line."""
+def test_follower_receives_additions_and_removals(relay: Relay) -> None:
+    """Removed by its program, or by the administrator with the command line."""
     ann, bob = relay.user("ann"), relay.user("bob")
     with client_of(relay, ann) as client, client_of(relay, bob) as reading:
         reader = Reader(reading, 5)
@@ -131,17 +131,17 @@ def test_who_follows_hears_what_comes_and_goes(relay: Relay) -> None:
 
 
 def alike(client: httpx.Client, kind: str) -> bool:
-    """Whether the directory has what the list of resources has."""
+    """Whether the service registry equals the list of resources."""
     listed = client.get(f"/api/v1/robots/rover/{kind}s", params={"limit": 1000}).json()[f"{kind}s"]
     entries = found(client, robot="rover", kind=kind)
     return [each["name"] for each in entries] == [each["name"] for each in listed]
 
 
 def leads(client: httpx.Client, kind: str) -> int:
-    """To how many of a kind the directory leads; none where one has gone meanwhile."""
+    """The number of entries of a kind that the registry links to; None if one has gone meanwhile."""
     entries = found(client, robot="rover", kind=kind)
-    told = [client.get(each["address"]).json().get("name") for each in entries]
-    return len(told) if told == [each["name"] for each in entries] else 0
+    reported = [client.get(each["address"]).json().get("name") for each in entries]
+    return len(reported) if reported == [each["name"] for each in entries] else 0
 
 
 @pytest.fixture
@@ -153,14 +153,14 @@ def peer(world: Any) -> Iterator[Peer]:
     peer.close()
 
 
-def test_what_robots_have_is_where_the_directory_says(world: Any, peer: Peer) -> None:
-    """For each as far as he may see it, as in the lists of resources."""
+def test_the_service_registry_links_to_resources_of_robots(world: Any, peer: Peer) -> None:
+    """For each user by their rights, as in the lists of resources."""
     for token in (world.operator, world.viewer):
         with client_of(world.relay, token) as client:
-            # A robot finds out about its graph and its cameras by and by.
+            # The graph and the cameras of a robot are discovered over time.
             wait_for("a camera is there", partial(found, client, robot="rover", kind="camera"))
             wait_for("odometry is there", partial(found, client, kind="topic", name="/odom"))
-            for kind in ("topic", "service", "action", "camera", "module"):
+            for kind in ("topic", "service", "action", "camera", "node"):
                 wait_for(f"each {kind} is told alike", partial(alike, client, kind))
             wait_for("services are there", partial(leads, client, "service"))
             (odom,) = found(client, kind="topic", name="/odom")
@@ -183,17 +183,17 @@ def test_what_robots_have_is_where_the_directory_says(world: Any, peer: Peer) ->
 
 @pytest.fixture
 def partner(world: Any) -> Iterator[Robot]:
-    """Another robot, of which the operator of the first one may call services."""
+    """Another robot, on which the first one's operator may call services."""
     robot = Robot(world.relay, "partner")
     with running(robot):
         world.relay.cli("right", "grant", "operator", "partner", "operator")
         yield robot
-    # Who sees it would see it in all tests that follow.
+    # It would be visible in all later tests.
     world.relay.cli("robot", "remove", "partner", "--yes")
 
 
 def test_a_program_at_one_robot_finds_and_calls_a_service_of_another(world: Any, partner: Robot) -> None:
-    """By what the directory says of it alone, as long as it is registered; who has no right there finds nothing."""
+    """By its entry only, while it is registered; a user without rights finds no entry."""
     body = {"kind": "service", "name": "start-over", "robot": "partner", "ttl": 3600}
     body["address"] = "/api/v1/robots/partner/services/reset"
     with (
@@ -207,7 +207,7 @@ def test_a_program_at_one_robot_finds_and_calls_a_service_of_another(world: Any,
         assert (service["robot"], service["user"]) == ("partner", "partners-program")
 
         def called() -> Any:
-            """The relay finds out by and by what a robot has."""
+            """A robot's graph is discovered over time."""
             answer = rovers.post(service["address"], json={})
             return answer.json()["values"] if answer.status_code == 200 else None
 
@@ -218,15 +218,15 @@ def test_a_program_at_one_robot_finds_and_calls_a_service_of_another(world: Any,
         assert other.get(f"{DIRECTORY}/{service['id']}").status_code == 404
         assert other.post(service["address"], json={}).status_code == 404
         assert [each["id"] for each in found(rovers, kind="service", name="start*")] == [service["id"]]
-        # Registered once more, for moments.
+        # Registered again, for a short time.
         assert own.post(DIRECTORY, json={**body, "ttl": 2}).headers["location"] == place
         wait_for("it is registered no more", lambda: found(rovers, kind="service", name="start*") == [])
         assert rovers.get(place).status_code == 404
         assert own.put(place).status_code == 404
 
 
-def test_nobody_registers_in_another_robots_name(world: Any) -> None:
-    """What one does is found by who sees the robot, who neither takes it out nor adds to it."""
+def test_robots_name_cannot_be_registered_by_others(world: Any) -> None:
+    """Viewers of the robot find its entries, and can neither remove them nor add others."""
     body = {"kind": "service", "name": "speech", "robot": "rover", "ttl": 3600}
     body["address"] = "/api/v1/robots/rover/services/say"
     with client_of(world.relay, world.operator) as client:

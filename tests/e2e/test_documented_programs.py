@@ -1,19 +1,20 @@
-"""The commands by which docs/ start services and applications work as they stand, against a relay and a robot."""
+"""Commands in docs/ that start services and applications run literally against a relay and a robot."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 from importlib.metadata import metadata
+from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from switchboard_examples import Example, examples
-from switchboard_scene import ROOT, Scene, staged
 
-from tests.robot_client.services.pictures_of_people import people
+from tests.worlds.doc_examples import Example, examples
+from tests.worlds.doc_scene import ROOT, Scene, staged
+from tests.worlds.face_images import people
 
-DOCUMENTS = [ROOT / "docs" / f"{name}.md" for name in ("apps", "services")]
+DOCUMENTS = [ROOT / "docs/guides" / f"{name}.md" for name in ("apps", "services")]
 SHOWN = [each for path in DOCUMENTS for each in examples(path)]
 PROGRAM, TYPED, CURL, INSTALLS = KINDS = (
     r"(switchboard-robot-service|.*\bpython -m robot_client\.apps\.\w+)\s",
@@ -25,11 +26,11 @@ PROGRAM, TYPED, CURL, INSTALLS = KINDS = (
 
 
 class Begun(NamedTuple):
-    """How one begins, by expressions.
+    """How a program starts, by expressions.
 
-    :param says: what it says
-    :param lacks: what it says instead, and ends with 1, where a machine has not the device it takes
-    :param stays: whether it goes on until it is ended
+    :param says: its output
+    :param lacks: its output, with exit code 1, on a machine without the device it needs
+    :param stays: whether it runs until it is ended
     """
 
     says: str
@@ -39,7 +40,7 @@ class Begun(NamedTuple):
 
 EXPECTED = {
     r"apps\.joystick ": Begun(r"no gamepad|\bbutton\b"),
-    r"apps\.voice ": Begun("listening", "a microphone takes sounddevice: pip|the microphone can't be used"),
+    r"apps\.voice ": Begun("listening", "a microphone needs sounddevice|cannot use the microphone"),
     r"apps\.collision_avoidance ": Begun("READY"),
     r"apps\.recharge ": Begun("looking for marker 7"),
     r"apps\.greeting ": Begun("looking for people"),
@@ -51,24 +52,24 @@ EXPECTED = {
 
 
 def lines(kind: str) -> list[Example]:
-    """Those of a kind."""
+    """Lines of a kind."""
     return [each for each in SHOWN if re.match(kind, each.command, re.DOTALL)]
 
 
 def expected(example: Example) -> list[str]:
-    """Which of them a program is."""
+    """The expectation for a program."""
     return [each for each in EXPECTED if re.search(each, example.command)]
 
 
 def before(example: Example) -> list[Example]:
-    """The lines of both documents that are typed once, before all others, and what the document has just above."""
+    """The lines that both documents have once before all others, and those just above the line."""
     above = SHOWN[SHOWN.index(example) - 1]
     return [each for each in lines(TYPED) if each.text.startswith("export ") or each == above]
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
-    """One for all, with what the documents take to be there."""
+    """One for all, with the preconditions of the documents."""
     with staged(tmp_path_factory.mktemp("programs"), camera=True) as made:
         people(made.folder / "people")
         (made.folder / "docs").symlink_to(ROOT / "docs")
@@ -76,8 +77,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         yield made
 
 
-def test_each_line_is_run() -> None:
-    """As just one thing, in whatever block of shell it stands; and nothing is expected of lines that are not there."""
+def test_lines_are_run() -> None:
+    """As exactly one kind, in any shell block; each expectation has a line."""
     fences = [re.findall(r"(?m)^ *(?:```|~~~)(.*)$", path.read_text()) for path in DOCUMENTS]
     assert {each for found in fences for each in found[::2]} == {"sh", "json"}
     found = {each.place: [kind for kind in KINDS if each in lines(kind)] for each in SHOWN}
@@ -91,17 +92,18 @@ def test_each_line_is_run() -> None:
 
 @pytest.mark.parametrize("example", lines(PROGRAM), ids=lambda each: each.place)
 def test_a_program_begins_and_ends(scene: Scene, example: Example) -> None:
-    """It says what it says of itself, and Ctrl-C ends it with 0.
+    """It prints its start line, and Ctrl-C ends it with 0.
 
-    The joystick waits for a gamepad where there is none, and says so; without a microphone or a player of sound voice
-    and speech end with 1, and say what is missing. The receiver of gps is a recording, as the document has it.
+    The joystick waits for a gamepad if there is none, and prints so; without a microphone or a player voice
+    and speech end with 1, and print the missing device. The receiver of gps is a recording, as in the
+    document.
     """
     begun = EXPECTED[expected(example)[0]]
     words = scene.folder / "words"
     text = "\n".join(each.text for each in [*before(example), example])
 
     def enough(printed: str) -> bool:
-        """What lacks something ends by itself."""
+        """A program without its device ends by itself."""
         return re.search(begun.says, printed + words.read_text(errors="replace")) is not None
 
     places = {"ROS_DOMAIN_ID=…": f"ROS_DOMAIN_ID={scene.robot.domain}"}
@@ -114,8 +116,14 @@ def test_a_program_begins_and_ends(scene: Scene, example: Example) -> None:
         assert (came.code, re.search(begun.says, said) is not None) == (0, True), came
 
 
-@pytest.mark.parametrize("example", lines(INSTALLS), ids=lambda each: each.place)
-def test_what_is_to_be_installed_is_there_to_be_installed(example: Example) -> None:
-    """The extras are those of our package."""
-    (asked,) = re.findall(r"'\.\[([\w,]+)\]'", example.command)
-    assert set(asked.split(",")) <= set(metadata("robot-switchboard").get_all("Provides-Extra") or [])
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda page: page.stem
+)
+def test_installed_extras_exist(page: Path) -> None:
+    """A page names only extras of our package."""
+    named = {
+        extra
+        for asked in re.findall(r"robot-switchboard\[([\w,]+)\]", page.read_text())
+        for extra in asked.split(",")
+    }
+    assert named <= set(metadata("robot-switchboard").get_all("Provides-Extra") or [])

@@ -1,4 +1,4 @@
-"""One message of every kind of array in every form, to clients that were not written for us, and to one by hand."""
+"""One message with every kind of array in every format, to third-party clients and to a test client."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import Any
 import cbor2
 import pytest
 from PIL import Image
-from switchboard_client import Client
 
 from relay_protocol.ros_types import TypeRegistry
+from tests.worlds.sync_client import Client
 
 CLIENTS = Path(__file__).parent / "clients"
 ROOT = Path(__file__).parents[2]
@@ -62,18 +62,18 @@ FORMS = ["none", "png", "cbor", "cbor-raw"]
 
 
 class Speaker:
-    """An operator who publishes the message again and again."""
+    """An operator that publishes the message repeatedly."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
         client.send(op="advertise", topic=TOPIC, type=TYPE)
 
     def say(self) -> None:
-        """Once."""
+        """Publishes it once."""
         self._client.send(op="publish", topic=TOPIC, msg=SENT)
 
     def until(self, done: subprocess.Popen[str]) -> str:
-        """Until a client has ended well; what it printed."""
+        """Waits until a client has exited with 0; returns its output."""
         try:
             for _ in range(600):
                 try:
@@ -91,13 +91,13 @@ class Speaker:
 
 @pytest.fixture
 def speaker(world: Any) -> Any:
-    """Somebody who publishes to the robot, where the relay's own subscription hears it too."""
+    """A publisher to the robot; the relay's own subscription receives the message too."""
     with world.relay.connect("rover", world.operator) as client:
         yield Speaker(client)
 
 
 def roslib(world: Any, speaker: Speaker, module: Path, compression: str, fragment_size: int = 0) -> Any:
-    """What roslib.js in Node makes of the message."""
+    """The message as roslib.js in Node decodes it."""
     command = [str(ROOT / "scripts" / "with-node.sh"), "node", "--no-deprecation"]
     command += [str(CLIENTS / "encodings.mjs"), str(module), world.relay.url("rover"), world.viewer]
     command += [TOPIC, TYPE, compression, str(fragment_size)]
@@ -106,9 +106,9 @@ def roslib(world: Any, speaker: Speaker, module: Path, compression: str, fragmen
 
 
 def checked(message: dict[str, Any], arrays: dict[str, str]) -> None:
-    """See that a message in CBOR is what was sent, as roslib.js has it.
+    """Checks that roslib.js has decoded a CBOR message unchanged.
 
-    :param arrays: the kind of array that each field of numbers is
+    :param arrays: the kind of array of each numeric field
     """
     for name, value in SENT.items():
         got = message[name]
@@ -123,7 +123,7 @@ def checked(message: dict[str, Any], arrays: dict[str, str]) -> None:
 
 
 def of_cdr(body: bytes) -> Any:
-    """A serialised message as JSON has it."""
+    """A serialised message in its JSON form."""
     types = TypeRegistry()
     folder = ROOT / "tests" / "interfaces" / "switchboard_test_interfaces" / "msg"
     text = (folder / "Sequences.msg").read_text()
@@ -153,7 +153,7 @@ def test_roslib_js_1_in_cbor(world: Any, speaker: Speaker) -> None:
 
 @pytest.mark.parametrize("module", [NEW, OLD], ids=["roslib 2", "roslib 1"])
 def test_roslib_js_in_raw_cbor(world: Any, speaker: Speaker, module: Path) -> None:
-    """The time at which it reached the robot, and the bytes ROS 2 sent."""
+    """It has the time of arrival at the robot, and the bytes of ROS 2."""
     message = roslib(world, speaker, module, "cbor-raw")
     assert abs(message["secs"] - time.time()) < 3600
     assert 0 <= message["nsecs"] < 10**9
@@ -163,12 +163,12 @@ def test_roslib_js_in_raw_cbor(world: Any, speaker: Speaker, module: Path) -> No
 
 @pytest.mark.parametrize("compression", ["none", "png"])
 def test_roslib_js_in_fragments(world: Any, speaker: Speaker, compression: str) -> None:
-    """It joins them; so it does with those of a PNG."""
+    """It joins them, those of a PNG too."""
     assert roslib(world, speaker, NEW, compression, 100) == AS_JSON
 
 
 def received(world: Any, speaker: Speaker, **ask: Any) -> list[str | bytes]:
-    """The websocket messages that one sample makes, by hand."""
+    """The raw websocket messages of one sample."""
     with world.relay.connect("rover", world.viewer) as client:
         client.send(op="subscribe", topic=TOPIC, type=TYPE, **ask)
         until = time.monotonic() + 30
@@ -185,10 +185,10 @@ def received(world: Any, speaker: Speaker, **ask: Any) -> list[str | bytes]:
 
 @pytest.mark.parametrize("fragment_size", [None, 64, 300])
 @pytest.mark.parametrize("compression", FORMS)
-def test_every_form_by_hand(
+def test_every_encoding_without_a_library(
     world: Any, speaker: Speaker, compression: str, fragment_size: int | None
 ) -> None:
-    """What SPEC 1.6 says, read with other libraries than the relay's clients use."""
+    """By SPEC 1.6, read with other libraries than the relay and its clients use."""
     messages = received(world, speaker, compression=compression, fragment_size=fragment_size)
     if compression.startswith("cbor"):
         (binary,) = messages
@@ -217,7 +217,7 @@ def test_every_form_by_hand(
 
 
 def by_hand(message: dict[str, Any]) -> None:
-    """See that a message in CBOR is what was sent, tag by tag (RFC 8746)."""
+    """Checks that a CBOR message is unchanged, tag by tag (RFC 8746)."""
     for name, value in SENT.items():
         got = message[name]
         if name in BYTES:

@@ -1,4 +1,4 @@
-"""The short-term memory, with a real relay, a real ROS 2 robot and httpx."""
+"""The event log, with a real relay, a real ROS 2 robot and httpx."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_processes import ros_environment
-from switchboard_pulse import Pulse
-from switchboard_relay import Relay
-from switchboard_waiting import wait_for
 
 from tests.robot_client.ros import Peer
+from tests.worlds.machine_pauses import Pulse
+from tests.worlds.processes import ros_environment
+from tests.worlds.relay_process import Relay
+from tests.worlds.waiting import wait_for
 
 EVENTS = "/api/v1/events"
 
@@ -31,20 +31,20 @@ def client_of(relay: Relay, token: str) -> httpx.Client:
 
 @pytest.fixture
 def operator(world: Any) -> Iterator[httpx.Client]:
-    """Requests of who may drive."""
+    """Requests of an operator."""
     with client_of(world.relay, world.operator) as client:
         yield client
 
 
 @pytest.fixture
 def stranger(world: Any) -> Iterator[httpx.Client]:
-    """Requests of who has no right on the robot."""
+    """Requests of a user without a right on the robot."""
     with client_of(world.relay, world.stranger) as client:
         yield client
 
 
 def asked(client: httpx.Client, **query: Any) -> list[dict[str, Any]]:
-    """Events, the newest first."""
+    """Events, newest first."""
     answer = client.get(EVENTS, params=query)
     assert answer.status_code == 200, answer.text
     found: list[dict[str, Any]] = answer.json()["events"]
@@ -52,7 +52,7 @@ def asked(client: httpx.Client, **query: Any) -> list[dict[str, Any]]:
 
 
 class Stream:
-    """A stream, read in a thread until so many events have come."""
+    """A stream, read in a thread until it has this many events."""
 
     def __init__(
         self, client: httpx.Client, query: dict[str, str], count: int, last: int | None = None
@@ -79,8 +79,8 @@ class Stream:
                 if len(self.events) == self._count:
                     return
 
-    def told(self) -> list[int]:
-        """The numbers of all that were wanted."""
+    def reported(self) -> list[int]:
+        """The numbers of all expected events."""
         wait_for(f"{self._count} events come", lambda: len(self.events) == self._count)
         self._thread.join(60)
         numbers = [each["id"] for each in self.events]
@@ -88,8 +88,10 @@ class Stream:
         return numbers
 
 
-def test_what_clients_do_leaves_events(world: Any, operator: httpx.Client) -> None:
-    """To come, to take control, to move the robot once, to call, to leave; whoever sees the robot reads of it."""
+def test_actions_of_clients_leave_events(world: Any, operator: httpx.Client) -> None:
+    """Connecting, taking control, first motion, calls and disconnecting; each user with a right on the robot
+    reads them.
+    """
     world.left_alone()
     with world.operating() as client, Pulse() as pulse:
 
@@ -116,7 +118,7 @@ def test_what_clients_do_leaves_events(world: Any, operator: httpx.Client) -> No
     assert taken["data"]["why"] == "a look around" and "address" not in taken["data"]
     begun = asked(operator, kind="motion.begun", **{"data.topic": "/cmd_vel"})
     times = sum(each["at"] >= taken["at"] for each in begun)
-    # Who is held up lets go by it, and begins once more.
+    # A delay counts as a release, so driving begins again.
     assert times == 1 or (times and lost)
     with client_of(world.relay, world.stranger) as stranger:
         assert asked(stranger, source="relay*") == []
@@ -126,8 +128,8 @@ def test_what_clients_do_leaves_events(world: Any, operator: httpx.Client) -> No
         }
 
 
-def test_what_is_watched_recorded_and_published_leaves_events(operator: httpx.Client) -> None:
-    """To view a camera, to record, once for both who ask by one key, and the first message to a topic."""
+def test_viewing_recording_and_publishing_leave_events(operator: httpx.Client) -> None:
+    """Viewing a camera, recording (once for two requests with one key), and the first message to a topic."""
     own = "/api/v1/robots/rover"
     begun = time.time() - 1
 
@@ -160,14 +162,14 @@ def test_what_is_watched_recorded_and_published_leaves_events(operator: httpx.Cl
 
 
 def test_nodes_that_come_and_go_and_their_parameters_leave_events(world: Any, operator: httpx.Client) -> None:
-    """A node is told of once; which parameter was set is told to who might ask for it."""
+    """Each node is reported once; the name of a parameter is shown only with the right to read it."""
     (online, *_) = asked(operator, kind="robot.online", robot="rover")
-    # A robot that has come finds its nodes one by one, which is no news.
+    # The nodes of a new robot are discovered one by one, without events.
     wait_for("it has settled", lambda: time.time() - online["at"] > 11)
     begun, param = time.time() - 1, "/robot/peer:loose"
 
-    def told(kind: str) -> list[dict[str, Any]]:
-        return asked(operator, kind=kind, robot="rover", since=begun, **{"data.module": "/robot/peer"})
+    def reported(kind: str) -> list[dict[str, Any]]:
+        return asked(operator, kind=kind, robot="rover", since=begun, **{"data.node": "/robot/peer"})
 
     def is_set() -> bool:
         return operator.put(f"/api/v1/robots/rover/params{param}", json={"value": "there"}).status_code == 204
@@ -176,14 +178,14 @@ def test_nodes_that_come_and_go_and_their_parameters_leave_events(world: Any, op
     try:
         peer.do("declare", "loose", "here")
         wait_for("its parameter is set", is_set)
-        wait_for("it is told to be there", lambda: told("module.up"))
-        assert told("module.down") == []
+        wait_for("it is told to be there", lambda: reported("node.up"))
+        assert reported("node.down") == []
     finally:
         peer.close()
-    wait_for("it is told to be gone", lambda: told("module.down"))
-    assert len(told("module.up")) == 1
+    wait_for("it is told to be gone", lambda: reported("node.down"))
+    assert len(reported("node.up")) == 1
     asking = {"kind": "param.set", "robot": "rover", "since": begun}
-    # A request whose answer came too late was sent again.
+    # A request without a timely answer was sent again.
     was_set = asked(operator, **asking)
     assert was_set[0]["data"] == {"param": param, "deleted": False}
     with client_of(world.relay, world.viewer) as viewer:
@@ -191,12 +193,12 @@ def test_nodes_that_come_and_go_and_their_parameters_leave_events(world: Any, op
         assert asked(viewer, **asking, **{"data.param": param}) == []
 
 
-def test_what_is_sent_again_with_its_key_is_written_once(operator: httpx.Client) -> None:
-    """And answered as before; where keys are not understood they are refused in words."""
+def test_repeated_events_with_their_key_are_written_once(operator: httpx.Client) -> None:
+    """The answer is the same as before; endpoints without support for keys refuse them."""
     event, key = {"kind": "once", "source": "again"}, {"Idempotency-Key": '"a first"'}
-    told = [operator.post(EVENTS, json=event, headers=key) for _ in range(3)]
-    assert {(each.status_code, each.text) for each in told} == {(201, told[0].text)}
-    assert [each["id"] for each in asked(operator, source="again")] == [told[0].json()["id"]]
+    reported = [operator.post(EVENTS, json=event, headers=key) for _ in range(3)]
+    assert {(each.status_code, each.text) for each in reported} == {(201, reported[0].text)}
+    assert [each["id"] for each in asked(operator, source="again")] == [reported[0].json()["id"]]
     changed = operator.post(EVENTS, json={**event, "data": {"n": 1}}, headers=key)
     assert (changed.status_code, changed.json()["code"]) == (422, "key_reused")
     for path, body in (
@@ -206,11 +208,15 @@ def test_what_is_sent_again_with_its_key_is_written_once(operator: httpx.Client)
         ("fleet", {"do": "call", "robots": ["rover"], "service": "/nobody"}),
     ):
         refused = operator.post(f"/api/v1/{path}", json=body, headers=key)
-        assert refused.status_code == 400 and "not understood" in refused.json()["detail"], path
+        assert (
+            refused.status_code == 400 and "is not supported at this address" in refused.json()["detail"]
+        ), path
 
 
-def test_was_this_person_greeted_in_the_last_minute(operator: httpx.Client, stranger: httpx.Client) -> None:
-    """One program asks what another has written, and greets nobody twice."""
+def test_events_show_who_was_greeted_in_the_last_minute(
+    operator: httpx.Client, stranger: httpx.Client
+) -> None:
+    """A program queries events of another one, so that no user is greeted twice."""
     query = {"kind": "greeted", "data.person": "ann", "last": 60, "count": "true"}
     assert stranger.get(EVENTS, params=query).json() == {"count": 0, "next": None}
     event = {"source": "greeting", "kind": "greeted", "data": {"person": "ann", "sure": 0.9}}
@@ -238,39 +244,39 @@ def test_was_this_person_greeted_in_the_last_minute(operator: httpx.Client, stra
         ("x", 400),
     ],
 )
-def test_what_can_not_be_kept_is_refused_in_words(operator: httpx.Client, body: Any, status: int) -> None:
+def test_unstorable_event_is_refused_with_a_reason(operator: httpx.Client, body: Any, status: int) -> None:
     """As problem details."""
     answer = operator.post(EVENTS, json=body)
     assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json")
     assert answer.json()["detail"]
 
 
-def test_what_was_missed_is_told_to_who_comes_back(operator: httpx.Client, stranger: httpx.Client) -> None:
-    """A stream begins with what is new, or behind the last event that its reader names."""
+def test_returning_follower_gets_missed_changes(operator: httpx.Client, stranger: httpx.Client) -> None:
+    """A stream begins with new events, or after the event named by its reader."""
     operator.post(EVENTS, json={"kind": "step", "source": "resume"})
     stream = Stream(stranger, {"source": "resume"}, 2)
     assert stream.open.wait(60)
     numbers = [
         operator.post(EVENTS, json={"kind": "step", "source": "resume"}).json()["id"] for _ in range(2)
     ]
-    assert stream.told() == numbers
+    assert stream.reported() == numbers
     missed = operator.post(
         EVENTS, json=[{"kind": "step", "source": "resume", "data": {"n": n}} for n in range(3)]
     )
     again = Stream(stranger, {"source": "resume"}, 4, last=numbers[0])
-    assert again.told() == [numbers[1], *(each["id"] for each in missed.json()["events"])]
+    assert again.reported() == [numbers[1], *(each["id"] for each in missed.json()["events"])]
 
 
 def test_all_that_match_are_exported(operator: httpx.Client) -> None:
-    """As lines of JSON and as a table that holds no formula, in as many parts as it takes."""
+    """As lines of JSON and as a table without formulas, in any number of pages."""
     for part in range(12):
         several = [{"kind": "=1+1", "source": "export", "data": {"n": part * 100 + n}} for n in range(100)]
         assert operator.post(EVENTS, json=several).status_code == 201
     query = {"source": "export"}
     lines = operator.get(EVENTS, params=query, headers={"Accept": "application/jsonl"})
     assert lines.headers["content-type"] == "application/jsonl"
-    told = [json.loads(line) for line in lines.text.splitlines()]
-    assert [each["data"]["n"] for each in told] == list(range(1199, -1, -1))
+    reported = [json.loads(line) for line in lines.text.splitlines()]
+    assert [each["data"]["n"] for each in reported] == list(range(1199, -1, -1))
     table = operator.get(EVENTS, params=query, headers={"Accept": "text/csv"})
     rows = list(csv.DictReader(io.StringIO(table.text, newline="")))
     assert [json.loads(row["data"])["n"] for row in rows] == list(range(1199, -1, -1))
@@ -283,8 +289,8 @@ def test_all_that_match_are_exported(operator: httpx.Client) -> None:
     assert pages == [500, 500, 200]
 
 
-def test_what_was_acknowledged_survives_kill_9(tmp_path: Path) -> None:
-    """While many write; the numbers go on, what was told to be refused is refused, and a source keeps to its share."""
+def test_acknowledged_change_survives_kill_9(tmp_path: Path) -> None:
+    """During many writes: numbers continue, refused events stay refused, and a source keeps within its quota."""
     relay = Relay(tmp_path, "--events-per-source", "500")
     try:
         token = relay.user("ann")

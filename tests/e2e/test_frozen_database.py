@@ -1,4 +1,6 @@
-"""A PostgreSQL server that stands still: each request is answered in time, in words, and all goes on afterwards."""
+"""A frozen PostgreSQL server: each request is answered in time with a reason, and everything continues
+afterwards.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,10 @@ import pgserver
 import psutil
 import psycopg
 import pytest
-from switchboard_processes import running
-from switchboard_relay import Relay
-from switchboard_waiting import PATIENCE, freeze, wait_for
+
+from tests.worlds.processes import running
+from tests.worlds.relay_process import Relay
+from tests.worlds.waiting import PATIENCE, freeze, wait_for
 
 ANSWER_SECONDS = 2
 REQUESTS = {
@@ -43,10 +46,11 @@ REQUESTS = {
 
 
 class Frozen:
-    """A relay on a PostgreSQL server that can be stopped and continued."""
+    """A relay on a PostgreSQL server that can be frozen and continued."""
 
     def __init__(self, folder: Path) -> None:
-        # Not in pytest's folder, which other users can't enter: under root the server is another user's.
+        # Outside pytest's folder, which other users cannot enter: under root the server runs as another
+        # user.
         self._folder = Path(tempfile.mkdtemp(prefix="pg-of-frozen-"))
         self._server = pgserver.get_server(self._folder / "data", cleanup_mode="stop")
         with psycopg.connect(self._server.get_uri(), autocommit=True) as connection:
@@ -56,7 +60,7 @@ class Frozen:
         self.token = self.relay.user("root", admin=True)
 
     def ask(self, method: str, path: str, body: Any) -> httpx.Response:
-        """One request on a connection of its own."""
+        """A request on a new connection."""
         headers = {"Authorization": f"Bearer {self.token}"}
         data = {"grant_type": "password", "username": "root", "password": "wrong horse"}
         sent = {"data": data} if path == "/oauth/token" else {"json": body} if body else {}
@@ -65,7 +69,7 @@ class Frozen:
 
     @contextmanager
     def standing_still(self) -> Iterator[None]:
-        """No process of the server runs."""
+        """All processes of the server are stopped."""
         postmaster = psutil.Process(int((self._folder / "data" / "postmaster.pid").read_text().split()[0]))
         stopped = [postmaster, *postmaster.children(recursive=True)]
         for each in stopped:
@@ -77,14 +81,13 @@ class Frozen:
                 os.kill(each.pid, signal.SIGCONT)
 
     def end(self) -> None:
-        """End the server."""
         self._server.cleanup()
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")
 def frozen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Frozen]:
-    """One for all."""
+    """One for all tests."""
     made = Frozen(tmp_path_factory.mktemp("frozen"))
     try:
         with running(made.relay):
@@ -93,15 +96,15 @@ def frozen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Frozen]:
         made.end()
 
 
-def test_each_request_is_answered_in_words_while_the_database_stands_still(frozen: Frozen) -> None:
-    """And once it goes on each is served at once, though hundreds were asked meanwhile; no event is kept twice."""
+def test_requests_are_answered_while_the_database_is_frozen(frozen: Frozen) -> None:
+    """Afterwards each request is served at once, despite hundreds meanwhile; no event is stored twice."""
     with frozen.standing_still(), ThreadPoolExecutor(64) as pool:
         asked = {what: pool.submit(frozen.ask, *request) for what, request in REQUESTS.items()}
         flood = [pool.submit(frozen.ask, *REQUESTS["robots"]) for _ in range(300)]
         answers = {what: each.result() for what, each in asked.items()}
         flooded = {each.result().status_code for each in flood}
     for what, answer in answers.items():
-        # What the relay knows without the database it may say.
+        # The relay may answer from its caches.
         assert answer.status_code in (200, 404, 503), (what, answer.text)
         if answer.status_code == 503:
             assert answer.headers["content-type"] == "application/problem+json"
@@ -117,7 +120,7 @@ def test_each_request_is_answered_in_words_while_the_database_stands_still(froze
 
 
 def test_a_wait_that_is_asked_for_is_no_part_of_the_limit(frozen: Frozen) -> None:
-    """A stream outlives it."""
+    """Streams outlive it."""
     url = f"http://127.0.0.1:{frozen.relay.http_port}/api/v1/robots/stream"
     headers = {"Authorization": f"Bearer {frozen.token}"}
     with httpx.stream("GET", url, headers=headers, timeout=PATIENCE) as answer:

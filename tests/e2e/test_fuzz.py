@@ -1,4 +1,6 @@
-"""Clients that break every rule at random, always the same at random: told or cut, and nobody else notices."""
+"""Clients that violate all rules with seeded random messages: each gets an error or is cut, and no other
+client is affected.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from switchboard_waiting import PATIENCE
-from switchboard_watchers import Watcher, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from relay_protocol import rosbridge
+from tests.worlds.bystanders import Watcher, undisturbed
+from tests.worlds.waiting import PATIENCE
 
 OPS = {each.__struct_config__.tag: each.__struct_fields__ for each in typing.get_args(rosbridge.ClientOp)}
 NAMES = (
@@ -52,8 +54,8 @@ TELL = '{"op":"set_level","level":"error"}'
 
 
 @pytest.fixture(autouse=True)
-def nobody_notices(world: Any, watchers: list[Watcher]) -> Iterator[None]:
-    """Bystanders, process, log and robot are as before."""
+def others_unaffected(world: Any, watchers: list[Watcher]) -> Iterator[None]:
+    """Bystanders, process, log and robot are unaffected."""
     daemon = len(world.robot.daemon.log.read_text())
     with undisturbed(world.relay, watchers):
         yield
@@ -62,7 +64,7 @@ def nobody_notices(world: Any, watchers: list[Watcher]) -> Iterator[None]:
 
 
 def value_for(field: str, chance: random.Random) -> Any:
-    """Often what the field wants, often not."""
+    """A value that often has the field's type."""
     if chance.random() < 0.25:
         return chance.choice(ODD)
     if field in ("topic", "service", "action"):
@@ -75,7 +77,7 @@ def value_for(field: str, chance: random.Random) -> Any:
 
 
 def message(chance: random.Random) -> str | bytes:
-    """One message: an op with some of its fields, and sometimes hardly that."""
+    """A message: an op with some of its fields, or sometimes less."""
     op = chance.choice(list(OPS))
     fields = {field: value_for(field, chance) for field in OPS[op] if chance.random() < 0.8}
     text = json.dumps({"op": op, **fields})
@@ -92,7 +94,7 @@ def message(chance: random.Random) -> str | bytes:
 
 
 def connected(world: Any, token: str) -> ClientConnection:
-    """A connection of a client that means no good."""
+    """A hostile client's connection."""
     return connect(
         world.relay.url("rover"),
         additional_headers={"Authorization": f"Bearer {token}"},
@@ -103,11 +105,11 @@ def connected(world: Any, token: str) -> ClientConnection:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_random_operations_are_told_or_cut(world: Any, seed: int) -> None:
-    """Each refusal is a sentence; who is cut gets a code and a reason, comes again and goes on."""
+def test_random_operations_are_refused_or_disconnected(world: Any, seed: int) -> None:
+    """Each refusal has a reason; a cut client gets a code and a reason, reconnects and continues."""
     chance = random.Random(seed)
     left = MESSAGES
-    told: list[str] = []
+    reported: list[str] = []
     while left:
         with connected(world, world.operator) as client:
             try:
@@ -115,29 +117,29 @@ def test_random_operations_are_told_or_cut(world: Any, seed: int) -> None:
                 while left:
                     left -= 1
                     if left % 100 == 0:
-                        client.send(TELL)  # one of the messages may have asked for silence
+                        client.send(TELL)  # one of the messages may have turned statuses off
                     client.send(message(chance))
-                    errors(client, 0, told)
-                errors(client, 1, told)
+                    errors(client, 0, reported)
+                errors(client, 1, reported)
             except ConnectionClosed as cut:
                 assert cut.rcvd is not None
                 assert cut.rcvd.reason
                 with contextlib.suppress(ConnectionClosed):
-                    errors(client, 1, told)
-    assert len(told) > MESSAGES / 20
+                    errors(client, 1, reported)
+    assert len(reported) > MESSAGES / 20
 
 
-def errors(client: ClientConnection, seconds: float, told: list[str]) -> None:
-    """Note the errors it is told, until nothing comes for so long."""
+def errors(client: ClientConnection, seconds: float, reported: list[str]) -> None:
+    """Collects errors until none arrives for a while."""
     with contextlib.suppress(TimeoutError):
         while True:
             heard = client.recv(timeout=seconds)
             if isinstance(heard, str) and '"level":"error"' in heard:
-                told.append(heard)
+                reported.append(heard)
 
 
 def test_random_bytes_after_the_handshake_are_cut(world: Any) -> None:
-    """Frames with reserved bits, without masks, of wrong lengths, half of them never finished."""
+    """Frames with reserved bits, without masks, with wrong lengths, half of them unfinished."""
     chance = random.Random(4)
     for _ in range(40):
         with contextlib.suppress(ConnectionClosed, OSError), connected(world, world.viewer) as client:
@@ -146,8 +148,8 @@ def test_random_bytes_after_the_handshake_are_cut(world: Any) -> None:
                 client.socket.close()
 
 
-def test_a_flood_of_everything_at_once_disturbs_nobody(world: Any) -> None:
-    """Ten clients of one user, each as fast as it can, none reading its answers."""
+def test_a_flood_of_all_operations_disturbs_no_other_client(world: Any) -> None:
+    """Ten clients of one user, each at full speed, without reading answers."""
     chance = random.Random(5)
     texts = [message(chance) for _ in range(200)]
     with contextlib.ExitStack() as stack:
@@ -161,8 +163,8 @@ def test_a_flood_of_everything_at_once_disturbs_nobody(world: Any) -> None:
             client.socket.close()
 
 
-def test_half_a_message_and_then_nothing_holds_nobody_up(world: Any) -> None:
-    """A frame that never ends, a fragmented message without its last part, fragments without their others."""
+def test_an_unfinished_message_delays_no_other_client(world: Any) -> None:
+    """An endless frame, a fragmented message without its last part, fragments without the others."""
     mask = os.urandom(4)
     with contextlib.ExitStack() as stack:
         first, second, third, another = (

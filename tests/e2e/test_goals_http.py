@@ -9,18 +9,18 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_processes import ros_environment
-from switchboard_waiting import wait_for
 
 from relay_server.common.freshness_tokens import HEADER
 from relay_server.http.idempotency import KEY_HEADER
 from tests.robot_client.ros import Peer
+from tests.worlds.processes import ros_environment
+from tests.worlds.waiting import wait_for
 
 ROBOT = "/api/v1/robots/rover"
 COUNTS, ENDLESS, SPIN, REJECTS = "/http/counts", "/http/endless", "/http/spin", "/http/rejects"
 ACTIONS = {COUNTS: "ok", ENDLESS: "forever", SPIN: "forever", REJECTS: "reject"}
 FIVE = {"goal": {"order": 5}}
-PATIENT = {**FIVE, "unwatched": 300}
+PATIENT = {**FIVE, "poll_timeout": 300}
 """A machine that runs tests may stand still for a while."""
 
 COUNTED = {"sequence": [0, 1, 1, 2, 3]}
@@ -35,7 +35,9 @@ def client_of(world: Any, token: str) -> httpx.Client:
 
 @pytest.fixture(scope="module")
 def peer(world: Any) -> Iterator[Peer]:
-    """A node of the robot with actions that succeed, never end, and reject; one that never ends moves the robot."""
+    """A node of the robot with actions that succeed, never end, and reject; one that never ends moves the
+    robot.
+    """
     peer = Peer(ros_environment(world.robot.domain))
     for name, kind in ACTIONS.items():
         peer.do("act", name, kind)
@@ -52,13 +54,13 @@ def peer(world: Any) -> Iterator[Peer]:
 
 @pytest.fixture
 def operator(world: Any, peer: Peer) -> Iterator[httpx.Client]:
-    """Requests of who may drive."""
+    """Requests of an operator."""
     with client_of(world, world.operator) as client:
         yield client
 
 
 def give(client: httpx.Client, action: str = ENDLESS, **body: Any) -> str:
-    """Give a goal that goes on; where its status is."""
+    """Sends a goal that runs; returns its status address."""
     answer = client.post(f"actions{action}", json={**PATIENT, **body})
     assert answer.status_code == 202, answer.text
     status = answer.json()
@@ -68,17 +70,17 @@ def give(client: httpx.Client, action: str = ENDLESS, **body: Any) -> str:
 
 
 def begun(client: httpx.Client, address: str) -> Any:
-    """Wait, looking, until a goal has come as far as its feedback tells, or is over; its status."""
+    """Polls until the goal's feedback shows progress, or it has ended; returns its status."""
 
-    def told() -> Any:
+    def reported() -> Any:
         status = client.get(address).json()
         return status if status["feedback"] == COUNTED or status["ended"] else None
 
-    return wait_for("the goal has begun", told)
+    return wait_for("the goal has begun", reported)
 
 
 def ended(client: httpx.Client, address: str) -> Any:
-    """Wait, looking, until a goal is over; its status."""
+    """Polls until a goal has ended; returns its status."""
 
     def over() -> Any:
         status = client.get(address).json()
@@ -88,21 +90,21 @@ def ended(client: httpx.Client, address: str) -> Any:
 
 
 class Ends:
-    """Goals that an action ends from now on, by the node itself."""
+    """Goals that an action's node ends from now on."""
 
     def __init__(self, peer: Peer, action: str) -> None:
         self._peer = peer
         self._action = action
-        self._before = len(peer.told("ended", action))
+        self._before = len(peer.reported("ended", action))
 
     def cancelled(self) -> None:
-        """Wait until it has ended one that was cancelled."""
-        self._peer.until(lambda: len(self._peer.told("ended", self._action)) > self._before)
-        assert self._peer.told("ended", self._action)[-1]["canceled"] is True
+        """Waits until it has ended a cancelled one."""
+        self._peer.until(lambda: len(self._peer.reported("ended", self._action)) > self._before)
+        assert self._peer.reported("ended", self._action)[-1]["canceled"] is True
 
 
-def test_who_prefers_to_wait_is_told_the_end(operator: httpx.Client) -> None:
-    """When it comes; else how far it is when the time is over."""
+def test_prefer_wait_answers_with_the_result(operator: httpx.Client) -> None:
+    """As soon as it arrives; otherwise with the progress at the timeout."""
     done = operator.post(f"actions{COUNTS}", json=FIVE, headers={"Prefer": "wait=60"})
     assert (done.status_code, done.headers["preference-applied"]) == (200, "wait=60")
     status = done.json()
@@ -117,26 +119,26 @@ def test_who_prefers_to_wait_is_told_the_end(operator: httpx.Client) -> None:
 
 
 def test_a_goal_is_read_again_only_when_it_is_another(operator: httpx.Client) -> None:
-    """Who knows how far it is waits for more; when it is over there is no more."""
+    """A client with the present status waits for a change; an ended goal does not change."""
     address = give(operator)
     begun(operator, address)
-    # Its feedback is the same again and again.
+    # Its feedback repeats the same value.
     known = {"If-None-Match": operator.get(address).headers["etag"]}
     assert operator.get(address, params={"wait": 0.3}, headers=known).status_code == 304
     assert operator.delete(address).json()["state"] == "cancelling"
     further = operator.get(address, params={"wait": 60}, headers=known)
     assert further.status_code == 200 and further.headers["etag"] != known["If-None-Match"]
     status = ended(operator, address)
-    assert (status["state"], status["reason"]) == ("canceled", "it was cancelled by who gave it")
+    assert (status["state"], status["reason"]) == ("canceled", "its owner cancelled it")
     last = {"If-None-Match": operator.get(address).headers["etag"]}
     assert operator.get(address, params={"wait": 60}, headers=last).status_code == 304
     assert operator.delete(address).status_code == 204
 
 
 def test_a_goal_is_followed_to_its_end(operator: httpx.Client) -> None:
-    """As server-sent events: how far it has come, then how it ended."""
+    """As server-sent events: feedback, then the result."""
     address = give(operator)
-    told: list[tuple[str, Any]] = []
+    reported: list[tuple[str, Any]] = []
     name = ""
     with operator.stream("GET", address, headers={"Accept": "text/event-stream"}) as answer:
         assert answer.headers["content-type"] == "text/event-stream"
@@ -145,37 +147,37 @@ def test_a_goal_is_followed_to_its_end(operator: httpx.Client) -> None:
             if field == "event":
                 name = value
             if field == "data":
-                told.append((name, json.loads(value)))
-                if len(told) == 1:
+                reported.append((name, json.loads(value)))
+                if len(reported) == 1:
                     operator.delete(address)
-    assert {each for each, _ in told[:-1]} == {"feedback"}
-    assert told[0][1]["sequence"][:3] == [0, 1, 1]
-    name, status = told[-1]
+    assert {each for each, _ in reported[:-1]} == {"feedback"}
+    assert reported[0][1]["sequence"][:3] == [0, 1, 1]
+    name, status = reported[-1]
     assert (name, status["state"], f"goals/{status['id']}") == ("ended", "canceled", address)
 
 
-def test_a_goal_whose_asker_vanishes_is_cancelled_on_the_robot(operator: httpx.Client, peer: Peer) -> None:
-    """As soon as nobody has looked at it for so long; a request that waits looks at it as long as it lasts."""
+def test_a_goal_of_a_gone_client_is_cancelled_on_the_robot(operator: httpx.Client, peer: Peer) -> None:
+    """When it was not polled for some time; a waiting request counts as polling."""
     ends = Ends(peer, ENDLESS)
-    wish = {**FIVE, "unwatched": 0.5}
+    wish = {**FIVE, "poll_timeout": 0.5}
     given = operator.post(f"actions{ENDLESS}", json=wish, headers={"Prefer": "wait=1.5"})
     assert (given.status_code, given.json()["state"]) == (202, "active")
     ends.cancelled()
     status = ended(operator, f"goals/{given.json()['id']}")
-    assert (status["state"], status["reason"]) == ("canceled", "nobody has looked at it for 0.5 s")
+    assert (status["state"], status["reason"]) == ("canceled", "its status was not requested for 0.5 s")
 
 
-def test_who_stops_following_looks_no_more(operator: httpx.Client, peer: Peer) -> None:
-    """A connection that ends is nobody who looks."""
+def test_ended_follower_is_removed(operator: httpx.Client, peer: Peer) -> None:
+    """A closed connection does not count as polling."""
     ends = Ends(peer, ENDLESS)
-    address = give(operator, unwatched=1)
+    address = give(operator, poll_timeout=1)
     with operator.stream("GET", address, headers={"Accept": "text/event-stream"}) as answer:
         assert next(each for each in answer.iter_lines() if each.startswith("data: "))
     ends.cancelled()
 
 
 def spins(client: httpx.Client) -> str:
-    """Have the robot spin as soon as it is ready to; where the goal's status is."""
+    """Makes the robot spin as soon as it is ready; returns the goal's status address."""
     moment = client.get("topics").headers[HEADER]
 
     def spinning() -> str:
@@ -191,10 +193,12 @@ def spins(client: httpx.Client) -> str:
     return str(wait_for("it spins", spinning))
 
 
-def test_control_that_is_lost_ends_a_goal_in_words(operator: httpx.Client, peer: Peer) -> None:
-    """One that moves the robot gives back a moment and takes control, and the node cancels it with that."""
+def test_loss_of_control_ends_a_goal_with_a_reason(operator: httpx.Client, peer: Peer) -> None:
+    """A goal that moves the robot needs a freshness token and takes control; without control the node cancels
+    it.
+    """
     needed = operator.post(f"actions{SPIN}", json=FIVE)
-    assert (needed.status_code, needed.json()["code"]) == (428, "moment_needed")
+    assert (needed.status_code, needed.json()["code"]) == (428, "freshness_required")
     ends = Ends(peer, SPIN)
     address = spins(operator)
     assert operator.get("control").json()["holder"]["user"] == "operator"
@@ -203,12 +207,12 @@ def test_control_that_is_lost_ends_a_goal_in_words(operator: httpx.Client, peer:
     status = ended(operator, address)
     assert (status["state"], status["reason"]) == (
         "canceled",
-        "control of robot rover was lost or given back",
+        "control of robot rover was lost or released",
     )
 
 
-def test_a_right_that_is_withdrawn_ends_a_goal_in_words(world: Any, peer: Peer) -> None:
-    """Its asker is told how it ended, and no more how far it had come."""
+def test_a_revoked_right_ends_a_goal_with_a_reason(world: Any, peer: Peer) -> None:
+    """Its client gets the end, without feedback."""
     token = world.relay.user("goal-giver")
     world.relay.cli("right", "grant", "goal-giver", "rover", "operator")
     ends = Ends(peer, ENDLESS)
@@ -222,8 +226,8 @@ def test_a_right_that_is_withdrawn_ends_a_goal_in_words(world: Any, peer: Peer) 
         assert "call on /http/endless" in status["reason"]
 
 
-def test_a_goal_is_nobody_elses(world: Any, operator: httpx.Client) -> None:
-    """Neither other users nor tokens for less can read, find or cancel it."""
+def test_a_goal_belongs_to_its_owner_only(world: Any, operator: httpx.Client) -> None:
+    """Other users and tokens with other scopes can neither read, find nor cancel it."""
     address = give(operator)
     made = world.relay.cli("token", "create", "operator", "--ttl", "1h", "--scope", "operator@rover")
     with client_of(world, world.viewer) as viewer, client_of(world, made["token"]) as narrower:
@@ -238,9 +242,9 @@ def test_a_goal_is_nobody_elses(world: Any, operator: httpx.Client) -> None:
     assert operator.delete(address).status_code == 202
 
 
-def test_what_is_sent_again_with_its_key_is_done_once(world: Any, operator: httpx.Client, peer: Peer) -> None:
-    """A goal, a call and a message, also two at the same time; with another body the key is refused."""
-    began = len(peer.told("began", COUNTS))
+def test_repeated_request_with_its_key_is_done_once(world: Any, operator: httpx.Client, peer: Peer) -> None:
+    """A goal, a call and a message, also concurrently; with another body the key is refused."""
+    began = len(peer.reported("began", COUNTS))
     key = {KEY_HEADER: '"the first"', "Prefer": "wait=60"}
     with ThreadPoolExecutor(2) as at_once:
         sent = [at_once.submit(operator.post, f"actions{COUNTS}", json=FIVE, headers=key) for _ in "ab"]
@@ -249,7 +253,7 @@ def test_what_is_sent_again_with_its_key_is_done_once(world: Any, operator: http
     assert [each.status_code for each in answers] == [200] * 3
     assert len({each.headers["location"] for each in answers}) == 1
     assert all(each.json() == answers[0].json() for each in answers)
-    assert len(peer.told("began", COUNTS)) == began + 1
+    assert len(peer.reported("began", COUNTS)) == began + 1
     other = operator.post(f"actions{COUNTS}", json={"goal": {"order": 6}}, headers=key)
     assert (other.status_code, other.json()["code"]) == (422, "key_reused")
     long = operator.post(f"actions{COUNTS}", json=FIVE, headers={KEY_HEADER: "k" * 256})
@@ -267,15 +271,21 @@ def test_what_is_sent_again_with_its_key_is_done_once(world: Any, operator: http
     assert heard == ["once", "then"]
 
 
-def test_goals_that_come_to_nothing_are_told_so(world: Any, operator: httpx.Client) -> None:
-    """Rejected, unknown, wrong, not allowed, with no sense."""
+def test_failed_goals_are_reported(world: Any, operator: httpx.Client) -> None:
+    """Rejected, unknown, invalid and denied ones."""
     rejected = operator.post(f"actions{REJECTS}", json=FIVE, headers={"Prefer": "wait=60"})
     assert (rejected.status_code, rejected.json()["state"]) == (200, "refused")
     assert "reject" in rejected.json()["reason"]
     wrong = operator.post(f"actions{COUNTS}", json={"goal": {"order": "five"}})
     assert wrong.status_code == 409 and "order" in wrong.json()["detail"]
     assert operator.post("actions/nowhere", json=FIVE).status_code == 404
-    for body in ({"unwatched": 0}, {"unwatched": 3601}, {"unwatched": "long"}, {"order": 5}, {"type": "a b"}):
+    for body in (
+        {"poll_timeout": 0},
+        {"poll_timeout": 3601},
+        {"poll_timeout": "long"},
+        {"order": 5},
+        {"type": "a b"},
+    ):
         assert operator.post(f"actions{COUNTS}", json={**FIVE, **body}).status_code == 400, body
     with client_of(world, world.viewer) as viewer:
         assert viewer.post(f"actions{COUNTS}", json=FIVE).status_code == 403

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment, running
-from switchboard_waiting import wait_for
+
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 NODE = Path(__file__).parent / "clients" / "introspected.py"
 FIBONACCI = "example_interfaces/action/Fibonacci"
@@ -39,7 +40,7 @@ DERIVED = {
 
 @pytest.fixture(scope="module", autouse=True)
 def node(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """It has a service that tells of its calls, and an action."""
+    """A node with a service with introspection and an action."""
     found = Process(
         [sys.executable, str(NODE)],
         tmp_path_factory.mktemp("node"),
@@ -55,14 +56,14 @@ def node(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 
 
 def type_of(client: Client, topic: str) -> str:
-    """What rosapi says of a topic that is named."""
+    """The type of a named topic in rosapi."""
     return str(client.call("/rosapi/topic_type", {"topic": topic})["values"]["type"])
 
 
 @pytest.mark.parametrize("topic", TOPICS)
 @pytest.mark.parametrize("typed", [True, False])
 def test_a_hidden_topic_is_subscribed_to_when_it_is_named(world: Any, topic: str, typed: bool) -> None:
-    """With its type and without."""
+    """With and without its type."""
     with world.operating() as client:
         client.send(op="subscribe", topic=topic, **({"type": TOPICS[topic]} if typed else {}))
         seen = client.until(op="publish", topic=topic)["msg"]
@@ -78,7 +79,7 @@ def test_a_hidden_topic_is_subscribed_to_when_it_is_named(world: Any, topic: str
 
 
 def test_hidden_topics_are_not_listed(world: Any) -> None:
-    """Neither by rosapi nor over HTTP nor as cameras; one that is named can be read over HTTP too."""
+    """Neither by rosapi nor over HTTP nor as cameras; a named one can be read over HTTP too."""
     with world.operating() as client:
         listed = client.call("/rosapi/topics")["values"]["topics"]
         assert not [each for each in listed if "/_" in each]
@@ -92,8 +93,8 @@ def test_hidden_topics_are_not_listed(world: Any) -> None:
 
 
 @pytest.mark.parametrize("name", DERIVED)
-def test_what_ros_makes_of_services_and_actions_are_types_like_all_others(world: Any, name: str) -> None:
-    """In rosapi's details of messages."""
+def test_derived_types_of_services_and_actions_are_types(world: Any, name: str) -> None:
+    """In rosapi's message details."""
     with world.operating() as client:
         first = client.call("/rosapi/message_details", {"type": name})["values"]["typedefs"][0]
         assert dict(zip(first["fieldnames"], first["fieldtypes"], strict=True)) == DERIVED[name]
@@ -101,15 +102,15 @@ def test_what_ros_makes_of_services_and_actions_are_types_like_all_others(world:
 
 
 def test_services_of_an_action_have_details_too(world: Any) -> None:
-    """Of what they are asked, and of what they answer."""
+    """Of their requests and responses."""
     with world.operating() as client:
         for part, wanted in (("request", ["goal_id"]), ("response", ["status", "result"])):
             answer = client.call(f"/rosapi/service_{part}_details", {"type": f"{FIBONACCI}_GetResult"})
             assert answer["values"]["typedefs"][0]["fieldnames"] == wanted
 
 
-def test_the_calls_of_a_service_are_for_those_who_may_call_it(world: Any) -> None:
-    """What it tells of its calls has all that is in them."""
+def test_service_events_need_the_right_to_call(world: Any) -> None:
+    """Service events contain the calls' full content."""
     with world.relay.connect("rover", world.viewer) as client:
         client.send(op="set_level", level="error")
         client.send(op="subscribe", id="s", topic="/told/_service_event", type=TOPICS["/told/_service_event"])

@@ -1,4 +1,4 @@
-"""An owner has topics held and commands suppressed over HTTP, with a real relay and a real ROS 2 robot."""
+"""An owner holds topics and suppresses commands over HTTP, with a real relay and a real ROS 2 robot."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_client import Client
-from switchboard_drive import LET_GO_SECONDS, UNDERSTOOD_SECONDS
-from switchboard_pulse import Pulse
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_threads import Driver
-from switchboard_waiting import PATIENCE, wait_for
 
 from relay_server.common.freshness_tokens import HEADER
+from tests.worlds.client_threads import Driver
+from tests.worlds.driving import LET_GO_SECONDS, UNDERSTOOD_SECONDS
+from tests.worlds.machine_pauses import Pulse
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import PATIENCE, wait_for
 
 LEVELS = {"olga": "owner", "ann": "operator", "vic": "viewer"}
 ODOM = {"topic": "/odom", "type": "nav_msgs/msg/Odometry"}
@@ -31,7 +31,7 @@ AGAIN = 5
 """So often the same is read again."""
 
 
-class Place:
+class ControlWorld:
     """A relay with a robot, and an owner, a driver and a viewer."""
 
     def __init__(self, folder: Path) -> None:
@@ -40,29 +40,30 @@ class Place:
         self.tokens = {name: self.relay.user(name) for name in LEVELS}
         for name, level in LEVELS.items():
             self.relay.cli("right", "grant", name, "rover", level)
+        with self.asking("olga") as client:
+            wait_for("the relay knows the topic", lambda: client.get("topics/odom").status_code == 200)
 
     def connect(self, name: str) -> Client:
-        """A websocket of one of them."""
+        """A user's websocket."""
         return self.relay.connect("rover", self.tokens[name])
 
     @contextmanager
     def asking(self, name: str) -> Iterator[httpx.Client]:
-        """Requests of one of them below the robot's address."""
+        """A user's requests below the robot's address."""
         headers = {"Authorization": f"Bearer {self.tokens[name]}"}
         base = f"http://127.0.0.1:{self.relay.http_port}/api/v1/robots/rover"
         with httpx.Client(base_url=base, headers=headers, timeout=PATIENCE) as client:
             yield client
 
     def stop(self) -> None:
-        """End everything."""
         self.robot.stop()
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """One for all tests, each of which leaves the robot as it was."""
-    made = Place(tmp_path_factory.mktemp("hold"))
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlWorld]:
+    """One for all tests, each of which restores the robot's state."""
+    made = ControlWorld(tmp_path_factory.mktemp("hold"))
     try:
         yield made
     finally:
@@ -70,30 +71,31 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
 
 
 @pytest.fixture
-def olga(place: Place) -> Iterator[httpx.Client]:
+def olga(scene: ControlWorld) -> Iterator[httpx.Client]:
     """Requests of the owner."""
-    with place.asking("olga") as client:
+    with scene.asking("olga") as client:
         yield client
 
 
 def by_websocket(client: Client) -> Iterator[Any]:
-    """Odometry as it comes."""
+    """Odometry by websocket."""
     client.send(op="subscribe", **ODOM)
     while True:
         yield client.until(op="publish", topic="/odom")["msg"]
 
 
 def by_events(client: httpx.Client) -> Generator[Any, None, None]:
-    """The same by HTTP."""
+    """Odometry by server-sent events."""
     with client.stream("GET", "topics/odom", headers={"Accept": "text/event-stream"}) as answer:
         assert answer.status_code == 200
         for line in answer.iter_lines():
-            if line.startswith("data: "):
+            # On a busy machine there may be statuses between the messages.
+            if line.startswith('data: {"header"'):
                 yield json.loads(line.removeprefix("data: "))
 
 
 def repeated(said: Iterator[Any]) -> Any:
-    """Read until the same has come again and again; what it is."""
+    """Reads until a message is repeated; returns it."""
     last, times = None, 0
     until = time.monotonic() + PATIENCE
     while times < AGAIN:
@@ -104,7 +106,7 @@ def repeated(said: Iterator[Any]) -> Any:
 
 
 def other(said: Iterator[Any], than: Any) -> Any:
-    """Read until another comes."""
+    """Reads until another message arrives."""
     until = time.monotonic() + PATIENCE
     for each in said:
         if each != than:
@@ -114,37 +116,37 @@ def other(said: Iterator[Any], than: Any) -> Any:
 
 
 def stamp(odometry: Any) -> tuple[int, int]:
-    """When the robot measured it."""
+    """Time of the robot's measurement."""
     return odometry["header"]["stamp"]["sec"], odometry["header"]["stamp"]["nanosec"]
 
 
-def test_what_is_held_says_its_last_value(place: Place, olga: httpx.Client) -> None:
-    """Again and again to all who read it already, until that is ended; then what is new."""
-    with place.connect("vic") as vic, place.asking("vic") as client, closing(by_events(client)) as events:
+def test_held_topic_repeats_its_last_value(scene: ControlWorld, olga: httpx.Client) -> None:
+    """To all present subscribers until the hold ends; then new messages follow."""
+    with scene.connect("vic") as vic, scene.asking("vic") as client, closing(by_events(client)) as events:
         readers = [by_websocket(vic), events]
         for each in readers:
             other(each, next(each))
         held = olga.post("hold", json={"resource": "/odom", "ms": 60_000})
         assert (held.status_code, held.json()) == (200, {"resource": "/odom", "ms": 60_000})
         last = [repeated(each) for each in readers]
-        told = wait_for("the robot tells of it", lambda: olga.get("control").json()["inhibited"])
-        assert [(each["resource"], each["hold"]) for each in told] == [("/odom", True)]
+        reported = wait_for("the robot reports it", lambda: olga.get("control").json()["inhibited"])
+        assert [(each["resource"], each["hold"]) for each in reported] == [("/odom", True)]
         assert olga.post("hold", json={"resource": "/odom", "ms": 0}).status_code == 200
         for reader, kept in zip(readers, last, strict=True):
             first = other(reader, kept)
             second = other(reader, first)
             assert stamp(kept) < stamp(first) < stamp(second)
-        wait_for("the robot tells of it", lambda: not olga.get("control").json()["inhibited"])
+        wait_for("the robot reports it", lambda: not olga.get("control").json()["inhibited"])
 
 
-def test_what_is_held_speaks_again_in_time(place: Place, olga: httpx.Client) -> None:
-    """By itself."""
-    with place.connect("vic") as vic:
+def test_held_topic_continues_in_time(scene: ControlWorld, olga: httpx.Client) -> None:
+    """By itself when its time is over."""
+    with scene.connect("vic") as vic:
         reader = by_websocket(vic)
         next(reader)
 
         def held() -> Any:
-            """What it said, where the machine was fast enough to see any of it."""
+            """The held message, or None on a machine too slow to see it."""
             assert olga.post("hold", json={"resource": "/odom", "ms": 2000}).status_code == 200
             begun, last = time.monotonic(), next(reader)
             while time.monotonic() < begun + 2.0:
@@ -157,10 +159,10 @@ def test_what_is_held_speaks_again_in_time(place: Place, olga: httpx.Client) -> 
         assert stamp(other(reader, kept)) > stamp(kept)
 
 
-def test_who_may_not_inhibit_holds_nothing(place: Place, olga: httpx.Client) -> None:
-    """It takes the right to; and there is one way."""
+def test_hold_needs_the_right_to_inhibit(scene: ControlWorld, olga: httpx.Client) -> None:
+    """There is no other method."""
     for name in ("ann", "vic"):
-        with place.asking(name) as client:
+        with scene.asking(name) as client:
             assert client.post("hold", json={"resource": "/odom"}).status_code == 403
     refused = olga.post("inhibit", json={"resource": "/odom", "hold": True})
     assert refused.status_code == 400 and "hold" in refused.json()["detail"]
@@ -169,42 +171,42 @@ def test_who_may_not_inhibit_holds_nothing(place: Place, olga: httpx.Client) -> 
     assert olga.get("control").json()["inhibited"] == []
 
 
-class Hand:
-    """Suppresses who drives, and commands in his place, by requests alone.
+class HttpOperator:
+    """Suppresses a driver and commands instead, by requests only.
 
-    :param client: of who may
+    :param client: of a user with the right
     """
 
     def __init__(self, client: httpx.Client) -> None:
         self._client = client
-        # By asking for what there is he has a connection, which the topic then obeys.
+        # Reading a resource opens the connection that the topic then obeys.
         self._moment = client.get("topics").headers[HEADER]
 
     def renew(self, ms: int = SUPPRESS_MS) -> None:
-        """The topic is his for so long."""
+        """Suppresses the topic for this time."""
         answer = self._client.post("suppress", json={"resource": "/cmd_vel", "ms": ms})
         assert answer.status_code == 200, answer.text
         self._moment = answer.headers[HEADER]
 
     def command(self, v: float) -> httpx.Response:
-        """One command."""
+        """Sends one command."""
         body = {"value": {"linear": {"x": v}}}
         answer = self._client.put("topics/cmd_vel", json=body, headers={HEADER: self._moment})
         self._moment = answer.headers[HEADER]
         return answer
 
     def overrules(self) -> tuple[int, int] | None:
-        """Command for a while by suppressions that follow each other without a gap.
+        """Commands for a while by overlapping suppressions.
 
-        :returns: from when to when nobody else was obeyed, monotonic nanoseconds; ``None`` where the machine was so
-            slow that there may have been a gap
+        :returns: start and end of the time without other commands, monotonic nanoseconds; ``None`` if the
+            machine was so slow that there may have been a gap
         """
         moments: list[int] = []
         with Pulse() as pulse:
             for _ in range(3 * SETTLED):
                 asked = time.monotonic_ns()
                 self.renew()
-                # The robot counts from when it was told, which was no earlier than it was asked.
+                # The robot counts from its receipt of the order, which is not before the request.
                 if moments and time.monotonic_ns() - moments[-1] > SUPPRESS_MS * 1e6:
                     return None
                 moments.append(asked)
@@ -214,34 +216,36 @@ class Hand:
 
 
 def speeds(robot: Robot, since: int, until: int) -> list[float]:
-    """What the robot was told in that time."""
+    """Speeds of commands to the robot in that time."""
     return [each["v"] for each in robot.events("command", since) if each["t"] <= until]
 
 
-def test_an_owner_suppresses_who_drives_by_requests(place: Place, olga: httpx.Client) -> None:
-    """His own commands move the robot, and none of the driver's; then it is the driver's again, once he has let go."""
-    robot = place.robot
-    time.sleep(LET_GO_SECONDS)  # so long the driver must say nothing
-    driver = Driver(place.connect("ann"), v=0.2, w=0.0)
+def test_an_owner_suppresses_a_driver_by_requests(scene: ControlWorld, olga: httpx.Client) -> None:
+    """The owner's commands move the robot, and the driver's do not; afterwards the driver's do, following a
+    pause.
+    """
+    robot = scene.robot
+    time.sleep(LET_GO_SECONDS)  # a pause of the driver
+    driver = Driver(scene.connect("ann"), v=0.2, w=0.0)
     driver.start()
     try:
         wait_for("the driver moves it", lambda: [each for each in robot.events("command") if each["v"] > 0])
-        hand = Hand(olga)
+        operator_ = HttpOperator(olga)
 
         def overruled() -> list[float] | None:
-            told = hand.overrules()
-            return None if told is None else speeds(robot, *told)
+            reported = operator_.overrules()
+            return None if reported is None else speeds(robot, *reported)
 
-        told = wait_for("it is suppressed without a gap", overruled)
-        assert min(told) < 0, "his own commands did not come through"
-        assert max(told) <= 0, "the driver's commands came through"
+        reported = wait_for("it is suppressed without a gap", overruled)
+        assert min(reported) < 0, "his own commands did not come through"
+        assert max(reported) <= 0, "the driver's commands came through"
         assert olga.get("control").json()["holder"]["user"] == "ann"
-        hand.renew(0)
+        operator_.renew(0)
         wait_for("nothing is suppressed", lambda: not olga.get("control").json()["suppressed"])
         since = time.monotonic_ns()
         wait_for("the driver has it again", _drives_on(robot, driver, since))
-        # The moment he gives back may be too old at first.
-        wait_for("he is refused", lambda: hand.command(-0.1).status_code == 403)
+        # The first token may be too old.
+        wait_for("he is refused", lambda: operator_.command(-0.1).status_code == 403)
         assert olga.get("control").json()["holder"]["user"] == "ann"
     finally:
         driver.stop()
@@ -249,7 +253,9 @@ def test_an_owner_suppresses_who_drives_by_requests(place: Place, olga: httpx.Cl
 
 
 def _drives_on(robot: Robot, driver: Driver, since: int) -> Callable[[], bool]:
-    """Let the driver let go, until he drives on: on a slow machine a pause is understood later, or not at all."""
+    """Makes the driver pause until its commands work: on a slow machine a pause may be detected late or not
+    at all.
+    """
 
     def driven() -> bool:
         driver.let_go(LET_GO_SECONDS)

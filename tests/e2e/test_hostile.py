@@ -1,4 +1,4 @@
-"""Peers that lie, babble or say nothing: refused in words, logged in words, and nobody else notices."""
+"""Peers that send invalid or no data get errors with reasons, which are logged, and do not affect others."""
 
 from __future__ import annotations
 
@@ -15,10 +15,6 @@ from typing import Any
 import httpx
 import psutil
 import pytest
-from switchboard_client import Client
-from switchboard_fake_robot import FakeRobot
-from switchboard_waiting import PATIENCE, wait_for
-from switchboard_watchers import Watcher, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -28,22 +24,26 @@ from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json
 from relay_server import PORTAL
 from relay_server.auth import passwords
+from tests.worlds.bystanders import Watcher, undisturbed
+from tests.worlds.fake_robot import FakeRobot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import PATIENCE, wait_for
 
 
 @pytest.fixture(autouse=True)
-def nobody_notices(world: Any, watchers: list[Watcher]) -> Iterator[None]:
-    """Whatever a test does, the bystanders go on, the process is the same, and the log shows no traceback."""
+def others_unaffected(world: Any, watchers: list[Watcher]) -> Iterator[None]:
+    """Bystanders continue, the process is the same, and the log has no traceback."""
     with undisturbed(world.relay, watchers):
         yield
 
 
 def logs(world: Any, words: str, since: int) -> None:
-    """These words come into the relay's log."""
+    """Waits for these words in the relay's log."""
     wait_for(f"the log says '{words}'", lambda: words in world.relay.log[since:])
 
 
 def robot_of_our_own(world: Any) -> tuple[str, bytes]:
-    """A robot enrolled with a key of the test's; its name and private key."""
+    """A robot enrolled with the test's key; returns its name and private key."""
     name = f"fake-{random.randrange(10**9)}"
     key = identity.generate_key()
     code = world.relay.cli("robot", "add", name)["enrolment_code"]
@@ -55,8 +55,8 @@ def robot_of_our_own(world: Any) -> tuple[str, bytes]:
 # --- identity ---------------------------------------------------------------------------------------------
 
 
-def test_a_robot_with_a_key_nobody_enrolled_is_refused(world: Any) -> None:
-    """A key made up on the spot opens nothing, and the robot whose name was used stays online."""
+def test_a_robot_with_an_unknown_key_is_refused(world: Any) -> None:
+    """A new key opens nothing, and the robot of that name stays online."""
     since = len(world.relay.log)
     with FakeRobot(world.relay.robots_port) as robot:
         answer = robot.register("rover", identity.generate_key())
@@ -80,7 +80,7 @@ def test_a_robot_that_claims_the_right_key_but_signs_with_another_is_refused(wor
 
 
 def test_a_recorded_proof_is_worth_nothing_on_another_connection(world: Any) -> None:
-    """A real proof, replayed against a new challenge, is refused; whom it was stolen from stays registered."""
+    """A real proof, repeated for a new challenge, is refused; its robot stays registered."""
     name, key = robot_of_our_own(world)
     with FakeRobot(world.relay.robots_port) as robot, FakeRobot(world.relay.robots_port) as thief:
         assert robot.register(name, key)["op"] == "welcome"
@@ -92,7 +92,7 @@ def test_a_recorded_proof_is_worth_nothing_on_another_connection(world: Any) -> 
 
 
 def test_used_expired_and_unknown_codes_get_the_same_words(world: Any) -> None:
-    """Nobody learns from the answer what was wrong with a code, nor whether there is such a robot."""
+    """The answer discloses neither the reason nor whether the robot exists."""
     used = world.relay.cli("robot", "add", "codes")["enrolment_code"]
     with FakeRobot(world.relay.robots_port) as robot:
         assert robot.enroll("codes", used, identity.generate_key())["op"] == "enrolled"
@@ -118,8 +118,8 @@ def test_used_expired_and_unknown_codes_get_the_same_words(world: Any) -> None:
     assert not any(code in world.relay.log for _, code in tries)
 
 
-def test_the_robots_own_command_says_why_a_code_was_refused(world: Any) -> None:
-    """``switchboard-robot enroll`` with a wrong code ends with the relay's sentence and a failure code."""
+def test_the_robots_own_command_gives_the_reason_of_a_refused_code(world: Any) -> None:
+    """``switchboard-robot enroll`` with a wrong code prints the relay's error and exits with a failure code."""
     done = world.robot.enroll(passwords.new_enrolment_code(), world.relay.robots_port, "--replace")
     assert done.returncode != 0
     assert "ask for a new one" in done.stderr
@@ -150,7 +150,7 @@ BAD_JSON = {
 
 @pytest.mark.parametrize("proved", [False, True], ids=["before the proof", "after the proof"])
 def test_a_frame_of_four_gigabytes_is_refused_before_it_is_awaited(world: Any, proved: bool) -> None:
-    """Four bytes of length are enough to say no; no memory is taken."""
+    """The four bytes of the length are enough to refuse it; no memory is allocated."""
     name, key = robot_of_our_own(world)
     since = len(world.relay.log)
     relay = psutil.Process(world.relay.process.popen.pid)
@@ -168,10 +168,10 @@ def test_a_frame_of_four_gigabytes_is_refused_before_it_is_awaited(world: Any, p
 
 
 @pytest.mark.parametrize("what", BAD_JSON)
-def test_bad_json_from_a_proved_robot_ends_its_link_in_words(
+def test_bad_json_from_a_proved_robot_ends_its_link_with_a_reason(
     world: Any, proved_robot: Any, what: str
 ) -> None:
-    """A robot that sends what is no message is told why, and cut."""
+    """A robot with an invalid message gets the reason and is disconnected."""
     text, words = BAD_JSON[what]
     since = len(world.relay.log)
     with proved_robot() as robot:
@@ -193,7 +193,7 @@ def test_bad_json_from_a_proved_robot_ends_its_link_in_words(
     ],
     ids=["a field", "a field of what nobody reads"],
 )
-def test_a_robots_message_with_a_key_twice_ends_the_connection_in_words(
+def test_a_robots_message_with_a_key_twice_ends_the_connection_with_a_reason(
     world: Any, text: bytes, words: str
 ) -> None:
     """Two readers could take different values."""
@@ -204,8 +204,8 @@ def test_a_robots_message_with_a_key_twice_ends_the_connection_in_words(
 
 
 @pytest.mark.parametrize("what", [each for each in BAD_JSON if "100,000" not in each and "twice" not in each])
-def test_bad_json_before_the_proof_ends_the_connection_in_words(world: Any, what: str) -> None:
-    """Who has proved nothing is told the same."""
+def test_bad_json_before_the_proof_ends_the_connection_with_a_reason(world: Any, what: str) -> None:
+    """Unauthenticated robots get the same reason."""
     text, words = BAD_JSON[what]
     with FakeRobot(world.relay.robots_port) as robot:
         robot.send_bytes(encode_json(text))
@@ -215,7 +215,7 @@ def test_bad_json_before_the_proof_ends_the_connection_in_words(world: Any, what
 
 @pytest.fixture(scope="module")
 def proved_robot(world: Any) -> Any:
-    """Opens registered links of a robot of the test's own, one after the other."""
+    """Opens registered links of the test's own robot, one after the other."""
     name, key = robot_of_our_own(world)
 
     @contextlib.contextmanager
@@ -239,10 +239,10 @@ def proved_robot(world: Any) -> Any:
     ],
     ids=["empty", "unknown kind", "short sample", "sample on the control link", "HTTP"],
 )
-def test_bytes_that_are_no_frames_end_a_robots_link_in_words(
+def test_bytes_that_are_no_frames_end_a_robots_link_with_a_reason(
     world: Any, proved_robot: Any, data: bytes, words: str
 ) -> None:
-    """Framing that breaks the contract is named."""
+    """The error names the broken framing."""
     with proved_robot() as robot:
         robot.send_bytes(data)
         assert words in robot.until("refused")["reason"]
@@ -271,8 +271,8 @@ BAD_ROSBRIDGE = {
 
 
 @pytest.mark.parametrize("what", BAD_ROSBRIDGE)
-def test_a_client_is_told_what_is_wrong_with_its_message(world: Any, what: str) -> None:
-    """One bad message costs a status in words and a line in the log; the connection goes on."""
+def test_a_bad_message_is_refused_with_the_reason(world: Any, what: str) -> None:
+    """A bad message causes a status with a reason and a line in the log; the connection continues."""
     text, words = BAD_ROSBRIDGE[what]
     since = len(world.relay.log)
     moved = world.left_alone()
@@ -289,7 +289,7 @@ def test_a_client_is_told_what_is_wrong_with_its_message(world: Any, what: str) 
 
 @pytest.mark.parametrize("number", ["9" * 5000, "1e999", "-1e999"])
 def test_a_number_too_large_is_no_command(world: Any, number: str) -> None:
-    """Numbers beyond doubles are named as such and never reach the robot."""
+    """Numbers beyond doubles get their own error and never reach the robot."""
     moved = world.left_alone()
     with world.relay.connect("rover", world.operator) as client:
         client.send(op="set_level", level="error")
@@ -302,7 +302,7 @@ def test_a_number_too_large_is_no_command(world: Any, number: str) -> None:
 
 
 def close_of(client: Client) -> Any:
-    """Read until the relay closes; the close frame."""
+    """Reads until the relay closes; returns the close frame."""
     with pytest.raises(ConnectionClosed) as closed:
         while True:
             client.receive()
@@ -311,11 +311,11 @@ def close_of(client: Client) -> Any:
 
 
 def test_a_flood_of_malformed_messages_ends_the_connection(world: Any) -> None:
-    """After a hundred messages in a row that are no rosbridge the connection is closed with 4429 and words."""
+    """After a hundred invalid messages in a row the connection is closed with 4429 and a reason."""
     since = len(world.relay.log)
     with world.relay.connect("rover", world.viewer) as client:
         with contextlib.suppress(ConnectionClosed):
-            # No more than are sent before the relay hangs up on who does not answer its close.
+            # No more than are sent before the relay drops a client that does not answer its close.
             for _ in range(2_000):
                 client.connection.send("{]")
         closed = close_of(client)
@@ -326,7 +326,7 @@ def test_a_flood_of_malformed_messages_ends_the_connection(world: Any) -> None:
 
 
 def test_a_binary_message_ends_the_connection(world: Any) -> None:
-    """Binary websocket messages are not taken, and the close says so."""
+    """Binary websocket messages are refused with a close frame."""
     since = len(world.relay.log)
     with world.relay.connect("rover", world.viewer) as client:
         client.connection.send(b"\x00\x01\x02")
@@ -369,7 +369,7 @@ def test_text_that_is_not_utf8_closes_every_websocket(
 
 @pytest.mark.parametrize("fragments", [1, 4], ids=["one frame", "fragments"])
 def test_a_message_over_ten_megabytes_ends_the_connection(world: Any, fragments: int) -> None:
-    """1009 and words for what is too big, whole or in pieces."""
+    """1009 with a reason, for a message in one frame or in several."""
     since = len(world.relay.log)
     text = '{"op":"publish","topic":"/x","msg":{"data":"' + "x" * limits.CLIENT_MESSAGE + '"}}'
     size = len(text) // fragments + 1
@@ -383,11 +383,11 @@ def test_a_message_over_ten_megabytes_ends_the_connection(world: Any, fragments:
     logs(world, str(limits.CLIENT_MESSAGE), since)
 
 
-# --- those who say little ---------------------------------------------------------------------------------
+# --- slow clients -----------------------------------------------------------------------------------------
 
 
 class Trickle(threading.Thread):
-    """Opens a connection, sends some bytes a second, and keeps what comes until it is cut off."""
+    """Opens a connection, sends some bytes per second, and records received bytes until it is cut."""
 
     def __init__(self, port: int, data: bytes, at_once: bytes = b"") -> None:
         super().__init__(daemon=True)
@@ -400,7 +400,7 @@ class Trickle(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        """A byte a second, for half a minute at most."""
+        """Sends a byte per second, for 30 s at most."""
         self._socket.settimeout(1.0)
         for place in range(30):
             try:
@@ -417,8 +417,8 @@ class Trickle(threading.Thread):
         self._socket.close()
 
 
-def test_who_does_not_get_to_the_point_is_cut_after_ten_seconds(world: Any) -> None:
-    """A byte a second resets no deadline: neither in HTTP's head nor its body, nor on the robots' port."""
+def test_client_without_a_request_is_cut_after_ten_seconds(world: Any) -> None:
+    """A byte per second extends no deadline: neither in HTTP's head nor its body, nor on the robots' port."""
     relay = world.relay
     since = len(relay.log)
     head = b"GET /healthz HTTP/1.1\r\nHost: example.org\r\n"
@@ -450,8 +450,8 @@ def test_who_does_not_get_to_the_point_is_cut_after_ten_seconds(world: Any) -> N
 
 
 @pytest.mark.parametrize("announced", [True, False], ids=["announced", "in chunks"])
-def test_a_request_that_is_too_big_is_refused_in_words(world: Any, announced: bool) -> None:
-    """A body over 64 KiB is answered with 413, before or while it comes."""
+def test_a_request_that_is_too_big_is_refused_with_a_reason(world: Any, announced: bool) -> None:
+    """A body over the limit gets 413, before or while it arrives."""
     since = len(world.relay.log)
     how = "Content-Length: 1000000" if announced else "Transfer-Encoding: chunked"
     head = f"POST /api/v1/session HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n{how}\r\n\r\n"
@@ -465,12 +465,12 @@ def test_a_request_that_is_too_big_is_refused_in_words(world: Any, announced: bo
             while data := plain.recv(65536):
                 answer += data
     assert answer.startswith(b"HTTP/1.1 413")
-    assert b"at most 65536 bytes" in answer
-    logs(world, "at most 65536 bytes", since)
+    assert b"at most 57344 bytes" in answer
+    logs(world, "at most 57344 bytes", since)
 
 
 def test_connections_that_came_and_went_are_not_held_against_an_address(world: Any) -> None:
-    """More connections than one address may hold at a time, one after the other, are all served."""
+    """More connections than the limit, one after the other, are all served."""
     for _ in range(600):
         with socket.create_connection(("127.0.0.1", world.relay.http_port)) as plain:
             plain.sendall(b"GET /robots/x HTTP/1.0\r\n\r\n")
@@ -484,11 +484,11 @@ def test_connections_that_came_and_went_are_not_held_against_an_address(world: A
         assert client.call("/relay/ping")["result"]
 
 
-def test_too_many_connections_of_one_address_are_refused_in_words(world: Any) -> None:
-    """One address can't take all the relay's descriptors; when it lets go, it is served again."""
+def test_too_many_connections_of_one_address_are_refused_with_a_reason(world: Any) -> None:
+    """One address cannot use all file descriptors of the relay; closed connections make room."""
     held = [socket.create_connection(("127.0.0.1", world.relay.http_port)) for _ in range(520)]
     try:
-        # The last ones are over the limit, whatever others hold.
+        # The last ones exceed the limit, whatever other connections exist.
         held[-1].settimeout(10)
         assert held[-1].recv(200).startswith(b"HTTP/1.1 429")
     finally:
@@ -504,8 +504,8 @@ def test_too_many_connections_of_one_address_are_refused_in_words(world: Any) ->
 
 
 @pytest.mark.parametrize("path", ["the largest file of the portal", "/api/openapi.json", "/nothing"])
-def test_answers_that_nobody_takes_use_little_memory(world: Any, path: str) -> None:
-    """Thousands of pipelined requests on twenty connections that read nothing: the next waits for the one before."""
+def test_answers_that_are_not_read_use_little_memory(world: Any, path: str) -> None:
+    """Thousands of pipelined requests on twenty connections without reading: each waits for the one before."""
     if not path.startswith("/"):
         assets = Path(PORTAL) / "assets"
         path = f"/assets/{max(assets.iterdir(), key=lambda each: each.stat().st_size).name}"
@@ -521,7 +521,7 @@ def test_answers_that_nobody_takes_use_little_memory(world: Any, path: str) -> N
             plain.settimeout(0.2)
             with contextlib.suppress(TimeoutError):
                 plain.sendall(one * (203_000 // len(one)))
-            # Once the relay answers this one it has done with what came before.
+            # The answer to this request shows that earlier input has been handled.
             httpx.get(f"http://127.0.0.1:{world.relay.http_port}/robots/rover", timeout=PATIENCE)
             highest = max(highest, relay.memory_info().rss)
     assert highest - before < 16 * limits.MIB

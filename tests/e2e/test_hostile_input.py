@@ -1,6 +1,6 @@
-"""What strangers send costs little, is answered, and hardly fills the log. Measured is the reactor's processor time.
+"""Hostile input costs little CPU time of the reactor, is answered, and is logged rarely.
 
-Bounds are several times what was measured, and a fraction of what it was while parsers were given all of it.
+Bounds are several times the measured values, and a fraction of the values from before parsers had limits.
 """
 
 from __future__ import annotations
@@ -14,13 +14,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_hostile import FIELDS, SHAPES, UPGRADE, Reactor, exchange, request, send, unproved
-from switchboard_relay import Relay
-from switchboard_small_robot import SmallRobot
-from switchboard_waiting import PATIENCE, wait_for
+
+from tests.worlds.hostile_inputs import (
+    FIELDS,
+    SHAPES,
+    UPGRADE,
+    Reactor,
+    exchange,
+    request,
+    send,
+    slowness,
+    unproved,
+)
+from tests.worlds.relay_process import Relay
+from tests.worlds.small_robot import SmallRobot
+from tests.worlds.waiting import PATIENCE, wait_for
 
 MOST = 0.1
-"""Processor seconds for one input; a tenth of them in the mean."""
+"""Processor seconds for one input on a machine as fast as the reference; a tenth of them in the mean."""
 
 NOTICED = 0.02
 """Processor seconds below which it does not matter how they grow."""
@@ -28,7 +39,7 @@ NOTICED = 0.02
 
 @pytest.fixture(scope="module")
 def relay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Relay]:
-    """A relay that serves as many requests as come."""
+    """A relay without a rate limit."""
     started = Relay(tmp_path_factory.mktemp("hostile"), "--requests-per-second", "0")
     yield started
     started.stop()
@@ -36,7 +47,7 @@ def relay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Relay]:
 
 @pytest.fixture
 def reactor(relay: Relay) -> Iterator[Reactor]:
-    """Its reactor. Whatever a test sends, the log shows no traceback."""
+    """The relay's reactor. The log must have no traceback after a test."""
     assert relay.process is not None
     logged = len(relay.log)
     yield Reactor(relay.process.popen.pid)
@@ -44,13 +55,13 @@ def reactor(relay: Relay) -> Iterator[Reactor]:
 
 
 def ask(relay: Relay, data: bytes) -> bytes:
-    """Send bytes to the port for clients on a connection of their own."""
+    """Sends bytes to the port for clients on a new connection."""
     with socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE) as connection:
         return exchange(connection, data)
 
 
-def test_no_input_of_a_stranger_takes_long_or_fails(relay: Relay, reactor: Reactor) -> None:
-    """Each field, path, query, form, body and frame, in each shape that some parser is slow on or stumbles over."""
+def test_no_unauthenticated_input_takes_long_or_fails(relay: Relay, reactor: Reactor) -> None:
+    """Each field, path, query, form, body and frame, in each form on which a parser is slow or fails."""
     logged = len(relay.log)
     slow, failed = [], []
     attacks = unproved()
@@ -64,7 +75,7 @@ def test_no_input_of_a_stranger_takes_long_or_fails(relay: Relay, reactor: React
         cost = reactor.cost(once)
         if cost > NOTICED:
             cost = min(cost, reactor.cost(once, 3))
-        if (cost > MOST and not attack.in_turns) or (
+        if (cost > MOST and cost > MOST * slowness() and not attack.in_turns) or (
             cost > NOTICED and cost > 3 * reactor.cost(lambda once=once: once(0.5), 3)
         ):  # type: ignore[misc]
             slow.append(f"{attack.name}: {cost:.3f} s")
@@ -72,8 +83,8 @@ def test_no_input_of_a_stranger_takes_long_or_fails(relay: Relay, reactor: React
             failed.append(f"{attack.name}: {answers[0][:60]!r}")
     assert slow == []
     assert failed == []
-    assert (reactor.seconds() - total) / len(attacks) < MOST / 10
-    # Twenty kinds of lines or so, each of them 30 times a minute.
+    assert (reactor.seconds() - total) / len(attacks) < MOST / 10 * slowness()
+    # About twenty kinds of lines, each at most 30 times a minute.
     assert len(relay.log) - logged < 30 * len(attacks)
 
 
@@ -115,16 +126,16 @@ FOUND = {
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_what_took_seconds_takes_none(relay: Relay, reactor: Reactor, name: str) -> None:
-    """As it was sent."""
+def test_slow_inputs_are_fast_now(relay: Relay, reactor: Reactor, name: str) -> None:
+    """The inputs are those that were slow."""
     answers: list[bytes] = []
-    assert reactor.cost(lambda: answers.append(ask(relay, FOUND[name])), 3) < 0.05
+    assert reactor.cost(lambda: answers.append(ask(relay, FOUND[name])), 3) < 0.05 * slowness()
     expected = b"HTTP/1.1 101" if name == "a short one's" else b"HTTP/1.1 4"
     assert all(each.startswith(expected) for each in answers)
 
 
 def test_eight_at_once_take_no_more_than_eight(relay: Relay, reactor: Reactor) -> None:
-    """They took 13.9 s."""
+    """They took 13.9 s before."""
 
     def all_at_once() -> None:
         threads = [
@@ -135,7 +146,7 @@ def test_eight_at_once_take_no_more_than_eight(relay: Relay, reactor: Reactor) -
         for each in threads:
             each.join()
 
-    assert reactor.cost(all_at_once, 3) < 8 * 0.05
+    assert reactor.cost(all_at_once, 3) < 8 * 0.05 * slowness()
 
 
 @pytest.mark.parametrize(
@@ -163,7 +174,7 @@ def test_a_content_type_that_failed_in_a_parser_is_answered(
 
 
 def grown(relay: Relay, data: bytes, times: int) -> int:
-    """By how many bytes the log grows when this is sent so often."""
+    """Growth of the log in bytes after this many requests."""
     before = len(relay.log)
     with socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE) as connection:
         for _ in range(times):
@@ -193,7 +204,7 @@ def test_a_flood_of_refusals_hardly_fills_the_log(relay: Relay, name: str, data:
 
 
 def test_a_handshake_that_never_finishes_closing_costs_no_line_each(relay: Relay) -> None:
-    """Nobody answers the relay's close."""
+    """The relay's close frames stay unanswered."""
     before = relay.log.count("\n")
     opened = [socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE) for _ in range(120)]
     refused = request("GET", b"/robots/x", UPGRADE | {"Authorization": b"Bearer x", "Origin": b"http://x"})
@@ -213,7 +224,7 @@ def _ended(connection: socket.socket) -> bool:
         return True
 
 
-# --- all that is described --------------------------------------------------------------------------------
+# --- all documented requests ------------------------------------------------------------------------------
 
 
 HEADERS = {
@@ -231,7 +242,9 @@ TEXTS = {
 def test_no_request_that_is_described_takes_long_or_fails(
     relay: Relay, reactor: Reactor, tmp_path: Path
 ) -> None:
-    """For each operation: names in its path, its parameters, all fields, and its body, in every shape, logged in."""
+    """For each operation: names in its path, its parameters, all fields, and its body, in every form,
+    authenticated.
+    """
     token = relay.user("walker", admin=True).encode()
     robot = SmallRobot(relay, "rover", {}).comes()
     chance = random.Random(16)
@@ -248,7 +261,7 @@ def test_no_request_that_is_described_takes_long_or_fails(
             cost = reactor.cost(once)
             if cost > NOTICED:
                 cost = min(cost, reactor.cost(once, 3))
-            if cost > MOST:
+            if cost > MOST and cost > MOST * slowness():
                 slow.append(f"{name}: {cost:.3f} s")
             if not answers[0] or answers[0].startswith(b"HTTP/1.1 500"):
                 failed.append(f"{name}: {answers[0][:60]!r}")
@@ -259,7 +272,7 @@ def test_no_request_that_is_described_takes_long_or_fails(
 
 
 def _described(described: dict[str, Any], chance: random.Random) -> Iterator[tuple[str, bytes]]:
-    """Requests of all operations: some shapes of each, other ones of the next, in each place they can stand in."""
+    """Requests of all operations, each with some forms in each of its places; the forms rotate."""
     for path, methods in described["paths"].items():
         for method, operation in methods.items():
             if "x-lasts" in operation:
@@ -267,10 +280,11 @@ def _described(described: dict[str, Any], chance: random.Random) -> Iterator[tup
             asked = operation.get("parameters", [])
             media = list(operation.get("requestBody", {}).get("content", {}))
             plain = _path(path, asked, None)
-            for shape in chance.sample(sorted(SHAPES), 16):
+            for shape in chance.sample(sorted(SHAPES), 6):
                 made, name = SHAPES[shape], f"{method} {path}: {shape}"
                 fields = {"Content-Type": media[0].encode()} if media else {}
-                yield f"{name} in the path", request(method.upper(), _path(path, asked, made(2000)), fields)
+                if (shaped := _path(path, asked, made(2000))) != plain:
+                    yield f"{name} in the path", request(method.upper(), shaped, fields)
                 queries = [each["name"] for each in asked if each["in"] == "query"]
                 if queries:
                     share = 6000 // len(queries)
@@ -297,7 +311,7 @@ def _described(described: dict[str, Any], chance: random.Random) -> Iterator[tup
 
 
 def _path(path: str, asked: list[dict[str, Any]], shape: bytes | None) -> bytes:
-    """An address; with a shape in the place of each name, but that of the robot."""
+    """An address with a form in place of each name, except the robot's."""
     for each in asked:
         if each["in"] == "path":
             known = "rover" if each["name"] == "robot" else "mode"

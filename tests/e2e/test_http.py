@@ -1,4 +1,4 @@
-"""The HTTP API over real sockets: who gets in, what a cookie is worth, what is shown to whom."""
+"""The HTTP API over real sockets: authentication, cookies, and rights."""
 
 from __future__ import annotations
 
@@ -13,30 +13,31 @@ from typing import Any
 
 import psutil
 import pytest
-from switchboard_client import Client
-from switchboard_http import Answer, ask
-from switchboard_relay import Relay
-from switchboard_waiting import PATIENCE, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+
+from tests.worlds.http_requests import Answer, ask
+from tests.worlds.relay_process import Relay
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import PATIENCE, wait_for
 
 PASSWORD = "correct horse"
 
 
 def own_origin(relay: Any) -> dict[str, str]:
-    """The Origin a browser sends from the relay's own portal."""
+    """The Origin of the relay's own portal."""
     return {"Origin": f"http://127.0.0.1:{relay.http_port}"}
 
 
 def log_in(relay: Any, user: str, password: str = PASSWORD) -> Answer:
-    """Log in by password, as the portal does."""
+    """Logs in by password, as the portal does."""
     body = {"user": user, "password": password}
     return ask(relay.http_port, "POST", "/api/v1/session", body, headers=own_origin(relay))
 
 
 @pytest.fixture
 def cookie(world: Any) -> dict[str, str]:
-    """A fresh session of the operator, as a header."""
+    """A new session of the operator, as a header."""
     return {"Cookie": log_in(world.relay, "operator").cookie}
 
 
@@ -51,7 +52,7 @@ def ticket(world: Any, robot: str = "rover") -> str:
 
 
 def test_the_first_start_prints_a_link_that_makes_one_administrator_once(tmp_path: Path) -> None:
-    """A relay nobody can log in to prints a one-time link; its second use is refused in words."""
+    """A relay without users who can log in prints a one-time link; its second use is refused with a reason."""
     relay = Relay(tmp_path)
     try:
         assert relay.process is not None
@@ -74,7 +75,7 @@ def test_the_first_start_prints_a_link_that_makes_one_administrator_once(tmp_pat
 
 
 def test_a_password_gives_a_session_in_a_cookie_that_scripts_and_other_sites_never_see(world: Any) -> None:
-    """The cookie is HttpOnly and SameSite=Strict, and it alone tells who one is."""
+    """The cookie is HttpOnly and SameSite=Strict, and authenticates alone."""
     answer = log_in(world.relay, "operator")
     assert answer.status == 200
     assert answer.json["user"] == "operator"
@@ -86,7 +87,7 @@ def test_a_password_gives_a_session_in_a_cookie_that_scripts_and_other_sites_nev
 
 
 def test_an_unknown_user_and_a_wrong_password_get_the_same_answer(world: Any) -> None:
-    """Nobody can find out which users there are."""
+    """The answer does not disclose which users exist."""
     unknown = log_in(world.relay, "no-such-user", "wrong password")
     wrong = log_in(world.relay, "viewer", "wrong password")
     assert unknown.status == wrong.status == 401
@@ -95,7 +96,9 @@ def test_an_unknown_user_and_a_wrong_password_get_the_same_answer(world: Any) ->
 
 
 def test_the_eleventh_wrong_password_is_refused_before_it_is_hashed(world: Any) -> None:
-    """Ten failures, then 429 with Retry-After, also for the right password, at no cost; others go on."""
+    """Ten failures, then 429 with Retry-After, even for the right password, without hashing; other users are
+    not affected.
+    """
     world.relay.user("forgetful")
     relay = psutil.Process(world.relay.process.popen.pid)
 
@@ -118,7 +121,7 @@ def test_the_eleventh_wrong_password_is_refused_before_it_is_hashed(world: Any) 
 
 
 def test_a_login_from_a_foreign_page_or_in_another_form_is_refused(world: Any) -> None:
-    """A page elsewhere can't log its visitor in here, neither by script nor by a form."""
+    """A page elsewhere cannot log its visitor in here, neither by script nor by a form."""
     body = {"user": "operator", "password": PASSWORD}
     foreign = {"Origin": "https://evil.example"}
     assert ask(world.relay.http_port, "POST", "/api/v1/session", body, headers=foreign).status == 403
@@ -148,7 +151,7 @@ def test_a_cookie_changes_nothing_without_the_relays_own_origin(
 
 
 def test_a_websocket_by_cookie_needs_the_relays_own_origin(world: Any, cookie: dict[str, str]) -> None:
-    """From the portal it opens; a program gets 403, a foreign page 4403 in words."""
+    """From the portal it opens; a program gets 403, a foreign page 4403 with a reason."""
     url = world.relay.url("rover")
     with Client(connect(url, additional_headers=cookie, origin=own_origin(world.relay)["Origin"])) as client:
         assert client.call("/relay/ping")["result"]
@@ -166,7 +169,7 @@ def test_a_websocket_by_cookie_needs_the_relays_own_origin(world: Any, cookie: d
 def test_logging_out_ends_the_session_and_the_websockets_opened_with_it(
     world: Any, cookie: dict[str, str]
 ) -> None:
-    """Whatever the session opened, by cookie or by ticket, is closed with 4401; other sessions stay."""
+    """Websockets opened by its cookie or ticket are closed with 4401; other sessions stay."""
     headers = {**cookie, **own_origin(world.relay)}
     issued = ask(world.relay.http_port, "POST", "/api/v1/tickets", {"robot": "rover"}, headers=headers).json
     url = world.relay.url("rover")
@@ -197,7 +200,7 @@ def test_logging_out_ends_the_session_and_the_websockets_opened_with_it(
 
 
 def test_everyone_sees_the_robots_they_have_a_right_on_and_no_other(world: Any) -> None:
-    """The list tells state and level; a stranger's is empty, and a foreign robot is not found."""
+    """The list has state and level; without rights it is empty, and a robot without a right is not found."""
     port = world.relay.http_port
     newcomer = world.relay.user("newcomer")
     world.relay.cli("right", "grant", "newcomer", "rover", "viewer")
@@ -215,8 +218,8 @@ def test_everyone_sees_the_robots_they_have_a_right_on_and_no_other(world: Any) 
     assert ask(port, "GET", "/api/v1/robots").status == 401
 
 
-def test_robots_are_listed_in_pages_and_told_once(world: Any) -> None:
-    """By name, with where the next page begins; who knows a list by its tag is told so while nothing changes."""
+def test_robots_are_listed_in_pages_each_once(world: Any) -> None:
+    """By name, with a cursor; a request with the entity tag of an unchanged list gets 304."""
     port = world.relay.http_port
     names = [f"shelf-{each}" for each in "abc"]
     reader = world.relay.user("shelf-reader")
@@ -244,41 +247,41 @@ def test_robots_are_listed_in_pages_and_told_once(world: Any) -> None:
 
 
 def states(stream: http.client.HTTPResponse) -> Iterator[str]:
-    """The states of the rover that a stream of events tells, one after the other."""
+    """States of the rover in a stream of events, one after the other."""
     while line := stream.readline():
         if line.startswith(b"data: "):
-            # Alerts come on the same stream.
+            # Alerts arrive on the same stream.
             robots = json.loads(line.removeprefix(b"data: ")).get("robots", ())
             yield from (each["state"] for each in robots if each["name"] == "rover")
 
 
-def test_the_stream_tells_when_a_robot_goes_and_comes(world: Any) -> None:
-    """Server-sent events carry the state of the caller's robots: offline when the daemon ends, then online."""
+def test_the_stream_reports_robots_that_leave_and_return(world: Any) -> None:
+    """Server-sent events have the state of the caller's robots: offline when the daemon ends, then online."""
     connection = http.client.HTTPConnection("127.0.0.1", world.relay.http_port, timeout=60)
     headers = {"Authorization": f"Bearer {world.viewer}"}
     try:
         connection.request("GET", "/api/v1/robots/stream", headers=headers)
         stream = connection.getresponse()
         assert stream.getheader("Content-Type") == "text/event-stream"
-        told = states(stream)
-        assert next(told) != "offline"
+        reported = states(stream)
+        assert next(reported) != "offline"
         assert world.robot.daemon.stop() == 0
-        assert next(each for each in told if each == "offline")
+        assert next(each for each in reported if each == "offline")
         world.robot.start_daemon()
-        assert next(each for each in told if each == "online")
+        assert next(each for each in reported if each == "online")
     finally:
         connection.close()
         world.wait_known()
 
 
 def test_a_page_follows_by_websocket_until_its_session_ends(world: Any, cookie: dict[str, str]) -> None:
-    """By its cookie and the relay's own origin; other pages are closed, and a robot's ticket opens nothing here."""
+    """By its cookie and the relay's own origin; other pages are closed, and a robot's ticket is refused."""
     url = f"ws://127.0.0.1:{world.relay.http_port}/api/v1/robots/stream"
     headers = {**cookie, **own_origin(world.relay)}
     with connect(url, additional_headers=cookie, origin=headers["Origin"]) as page:
-        told = json.loads(page.recv(PATIENCE))
-        assert told["event"] == "robots"
-        (rover,) = (each for each in told["data"]["robots"] if each["name"] == "rover")
+        reported = json.loads(page.recv(PATIENCE))
+        assert reported["event"] == "robots"
+        (rover,) = (each for each in reported["data"]["robots"] if each["name"] == "rover")
         listed = ask(world.relay.http_port, "GET", "/api/v1/robots/rover", headers=cookie).json
         assert rover.keys() == listed.keys()
         assert json.loads(page.recv(PATIENCE))["event"] == "alerts"
@@ -299,7 +302,7 @@ def test_a_page_follows_by_websocket_until_its_session_ends(world: Any, cookie: 
 
 
 def test_a_ticket_opens_one_websocket_to_one_robot(world: Any) -> None:
-    """The second use is refused, so is another robot, and nobody gets a ticket without a right."""
+    """A second use and another robot are refused, and a user without a right gets no ticket."""
     single = ticket(world)
     with Client(connect(f"{world.relay.url('rover')}?ticket={single}")) as client:
         assert client.call("/relay/ping")["result"]
@@ -314,8 +317,8 @@ def test_a_ticket_opens_one_websocket_to_one_robot(world: Any) -> None:
     assert denied.status == 404
 
 
-def test_a_plain_get_of_a_robots_websocket_tells_what_speaks_there(world: Any) -> None:
-    """What rosbridge clients ask first is answered with product and version."""
+def test_a_plain_get_of_a_robots_websocket_names_its_protocol(world: Any) -> None:
+    """The first request of rosbridge clients is answered with product and version."""
     about = ask(world.relay.http_port, "GET", "/robots/rover")
     assert about.status == 200
     assert about.json["product"] == "switchboard"
@@ -326,7 +329,7 @@ def test_a_plain_get_of_a_robots_websocket_tells_what_speaks_there(world: Any) -
 
 
 def test_health_is_for_everyone_and_metrics_for_administrators(world: Any) -> None:
-    """/healthz answers without credentials, /metrics only to an administrator, with real figures."""
+    """/healthz answers without credentials, /metrics only to an administrator, with real values."""
     port = world.relay.http_port
     chief = world.relay.user("chief", admin=True)
     assert ask(port, "GET", "/healthz").json == {"status": "ok"}
@@ -334,7 +337,7 @@ def test_health_is_for_everyone_and_metrics_for_administrators(world: Any) -> No
     assert ask(port, "GET", "/metrics", token=world.operator).status == 403
     with world.relay.connect("rover", world.viewer) as client:
         assert client.call("/relay/ping")["result"]
-        # Others may be there besides, and a robot that was held up comes back by and by.
+        # Other robots may exist, and a delayed robot reconnects over time.
         for figure in (r"switchboard_clients", r'switchboard_robots\{state="in_use"\}'):
             pattern = re.compile(rf"^{figure} [1-9]", re.MULTILINE)
             wait_for(
@@ -345,8 +348,8 @@ def test_health_is_for_everyone_and_metrics_for_administrators(world: Any) -> No
             )
 
 
-def test_what_does_not_exist_is_said_as_problem_details(world: Any) -> None:
-    """Unknown addresses and methods are answered in words, and no path leads out of the portal's folder."""
+def test_missing_resource_answers_problem_details(world: Any) -> None:
+    """Unknown addresses and methods get reasons, and no path leads out of the portal's folder."""
     port = world.relay.http_port
     for path in ("/api/v1/nothing", "/nothing", "/assets/../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd"):
         answer = ask(port, "GET", path)
@@ -369,7 +372,7 @@ def test_the_portal_comes_with_headers_that_close_what_browsers_leave_open(world
 
 
 def test_secrets_are_in_no_log_no_process_list_and_no_file_others_can_read(world: Any) -> None:
-    """Tokens, passwords, cookies, tickets and codes leave no trace where others could look."""
+    """Tokens, passwords, cookies, tickets and codes."""
     relay = world.relay
     session = log_in(relay, "operator")
     code = relay.cli("robot", "add", "secretive")["enrolment_code"]
@@ -393,6 +396,6 @@ def test_secrets_are_in_no_log_no_process_list_and_no_file_others_can_read(world
 
 
 def test_the_relay_has_logged_no_failure_of_its_own(world: Any) -> None:
-    """Nothing above made the relay stumble."""
+    """The requests above caused no failure of the relay."""
     wait_for("the relay answers", lambda: ask(world.relay.http_port, "GET", "/healthz").status == 200)
     assert "Traceback" not in world.relay.log

@@ -1,4 +1,4 @@
-"""What reaches a robot that speaks JSON, by the bytes of its link."""
+"""Messages to a robot that speaks JSON, by the bytes of its link."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from typing import Any
 
 import msgspec
 import pytest
-from switchboard_client import Client
-from switchboard_small_robot import SmallRobot
-from switchboard_waiting import wait_for
+
+from tests.worlds.small_robot import SmallRobot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 
 
 def echo(robot: SmallRobot, args: Any) -> Any:
-    """Keep what a service was called with."""
+    """Records the arguments of service calls."""
     robot.heard.append(args)
     return msgspec.Raw(b"{}")
 
@@ -33,14 +34,14 @@ def small(world: Any) -> Iterator[SmallRobot]:
 
 
 def refused(client: Client, topic: str, type_name: str, msg: str) -> str:
-    """Why a message does not go to the robot."""
+    """The error of a message that is not sent to the robot."""
     text = f'{{"op":"publish","id":"p","topic":"{topic}","type":"{type_name}","msg":{msg}}}'
     client.connection.send(text)
     return str(client.until(op="status", id="p")["msg"])
 
 
 def test_only_what_is_of_the_type_with_exact_numbers(world: Any, small: SmallRobot) -> None:
-    """Messages and arguments are checked as for robots that speak CDR, and go in the client's own words."""
+    """Messages and arguments are checked as for CDR robots, and sent in the client's own text."""
     with world.relay.connect("small", world.operator) as client:
         client.send(op="set_level", level="error")
         wrong = "linear.x must be a number, not a boolean"

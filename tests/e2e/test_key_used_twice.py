@@ -1,4 +1,4 @@
-"""Two daemons with the key of one robot: its owners are told at once."""
+"""Two daemons with the key of one robot: its owners are notified at once."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_fake_robot import FakeRobot
-from switchboard_http import ask
-from switchboard_processes import BIN, Process, ros_environment
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
 
 from relay_protocol import identity, link
+from tests.worlds.fake_robot import FakeRobot
+from tests.worlds.http_requests import ask
+from tests.worlds.processes import BIN, Process, ros_environment
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.waiting import wait_for
 
 KEY = b"k" * 32
 
 
 class People:
-    """Who has a right on the robot, and what they are told of its key."""
+    """Users with rights on the robot, and their alerts and events about its key."""
 
     def __init__(self, relay: Relay, robot: str) -> None:
         self._relay, self._robot = relay, robot
@@ -55,12 +55,12 @@ def relay(tmp_path: Path) -> Iterator[Relay]:
 
 
 def answers_a_ping(robot: FakeRobot) -> None:
-    """All that have come, but at least one."""
+    """Answers all received pings, but at least one."""
     robot.send(link.Pong(t=robot.until("ping")["t"], at=1))
 
 
-def test_both_addresses_are_told_to_owners_with_the_first_registration(relay: Relay) -> None:
-    """The second link is refused, and the first one answers: that is enough. Viewers learn no address."""
+def test_owners_see_both_addresses_and_the_first_registration(relay: Relay) -> None:
+    """The second link is refused, and the first one answers: that is enough. Viewers get no address."""
     code = relay.cli("robot", "add", "twin")["enrolment_code"]
     with FakeRobot(relay.robots_port) as robot:
         assert robot.enroll("twin", code, KEY)["op"] == "enrolled"
@@ -73,11 +73,11 @@ def test_both_addresses_are_told_to_owners_with_the_first_registration(relay: Re
         answers_a_ping(first)
         assert second.register("twin", KEY)["op"] == "refused"
 
-        def told() -> bool:
+        def reported() -> bool:
             answers_a_ping(first)
             return bool(people.alerts("owner"))
 
-        wait_for("the owner is told", told)
+        wait_for("the owner is notified", reported)
     (alert,) = people.alerts("owner")
     assert (alert["level"], alert["robot"]) == ("error", "twin")
     assert "127.0.0.2, 127.0.0.3" in alert["text"]
@@ -88,8 +88,8 @@ def test_both_addresses_are_told_to_owners_with_the_first_registration(relay: Re
     assert identity.fingerprint(identity.public_half(KEY)) not in str(alert)
 
 
-def test_a_copy_of_a_daemon_is_told_of(relay: Relay) -> None:
-    """Two real daemons that take the robot from each other; the alert stays one."""
+def test_a_copy_of_a_daemon_is_an_alert(relay: Relay) -> None:
+    """Two real daemons displace each other; there is only one alert."""
     robot = Robot(relay, "twin")
     copy: Process | None = None
     try:
@@ -98,11 +98,11 @@ def test_a_copy_of_a_daemon_is_told_of(relay: Relay) -> None:
         shutil.copytree(robot.state, state, ignore=shutil.ignore_patterns("*.lock", "*.sock"))
         command = [str(BIN / "switchboard-robot"), "run", "--state", str(state)]
         copy = Process(command, robot.folder, "copy", ros_environment(robot.domain))
-        (alert,) = wait_for("the owner is told", lambda: people.alerts("owner"))
+        (alert,) = wait_for("the owner is notified", lambda: people.alerts("owner"))
         assert "127.0.0.1, 127.0.0.1" in alert["text"]
         assert wait_for("the event is kept", lambda: people.events("owner"))
-        # It comes again and again.
-        wait_for("it is told again", lambda: people.alerts("owner")[0]["count"] > 2)
+        # Both connect repeatedly.
+        wait_for("the alert counts more of them", lambda: people.alerts("owner")[0]["count"] > 2)
         assert len(people.alerts("owner")) == 1
     finally:
         if copy is not None:
@@ -110,8 +110,8 @@ def test_a_copy_of_a_daemon_is_told_of(relay: Relay) -> None:
         robot.stop()
 
 
-def test_a_daemon_that_starts_again_is_not_told_of(relay: Relay) -> None:
-    """However it ended."""
+def test_a_restarted_daemon_is_no_alert(relay: Relay) -> None:
+    """For any way of ending."""
     robot = Robot(relay, "twin")
     with stopping(robot):
         people = People(relay, "twin")
@@ -123,13 +123,13 @@ def test_a_daemon_that_starts_again_is_not_told_of(relay: Relay) -> None:
 
 
 def online(people: People) -> int:
-    """How often the robot has come."""
+    """The number of connections of the robot."""
     return sum(each["kind"] == "robot.online" for each in people._get("owner", "events", "events"))
 
 
 @contextlib.contextmanager
 def stopping(robot: Robot) -> Iterator[Robot]:
-    """Stopped in the end."""
+    """Stops it at the end."""
     try:
         yield robot
     finally:

@@ -1,4 +1,4 @@
-"""Organised point clouds of a real graph: those that pass, and those of which somebody is told."""
+"""Organised point clouds of a real graph: those that pass, and those that cause an error."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 
 import cbor2
 import pytest
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment, running
-from switchboard_robot import Robot
 from websockets.sync.client import connect
+
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
 
 MIB = 1024 * 1024
 NODE = Path(__file__).parent / "clients" / "clouds.py"
@@ -24,7 +25,9 @@ PASSES, TOO_LARGE = 18 * MIB, 21 * MIB
 
 @pytest.fixture(scope="module")
 def cloudy(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
-    """A robot that sends messages of up to 20 MiB, with a node that has published one of 18 and one of 21."""
+    """A robot that sends messages of up to 20 MiB, with a node that has published one of 18 MiB and one of 21
+    MiB.
+    """
     robot = Robot(world.relay, "cloudy", daemon_env={"SWITCHBOARD_ROBOT_ROS_LARGEST_SAMPLE_MB": "20"})
     try:
         world.relay.cli("right", "grant", "operator", "cloudy", "operator")
@@ -39,7 +42,7 @@ def cloudy(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rob
 
 @pytest.fixture
 def client(world: Any, cloudy: Robot) -> Iterator[Client]:
-    """A client that takes messages of any size and wants to hear of errors."""
+    """A client that accepts messages of any size and receives errors."""
     url = world.relay.url("cloudy")
     headers = {"Authorization": f"Bearer {world.operator}"}
     with Client(connect(url, additional_headers=headers, max_size=None)) as client:
@@ -48,7 +51,7 @@ def client(world: Any, cloudy: Robot) -> Iterator[Client]:
 
 
 def test_an_organised_cloud_passes(client: Client) -> None:
-    """More than fits into a frame of the robot's link."""
+    """It is larger than a frame of the robot's link."""
     for _ in range(2):
         client.send(op="subscribe", topic="/organised", type=CLOUD, compression="cbor")
         message = cbor2.loads(client.connection.recv(timeout=60))
@@ -57,8 +60,8 @@ def test_an_organised_cloud_passes(client: Client) -> None:
         client.send(op="unsubscribe", topic="/organised")
 
 
-def test_of_what_is_too_large_the_subscriber_is_told(client: Client, cloudy: Robot) -> None:
-    """Why, and what to do; it is counted in the status, and the robot's log has one line."""
+def test_the_subscriber_is_notified_of_samples_that_are_too_large(client: Client, cloudy: Robot) -> None:
+    """With reason and advice; the status counts it, and the robot's log has one line."""
     client.send(op="subscribe", id="e", topic="/enormous", type=CLOUD)
     words = client.until(op="status", id="e")["msg"]
     assert words.startswith("/enormous: a message of 220")
@@ -70,7 +73,7 @@ def test_of_what_is_too_large_the_subscriber_is_told(client: Client, cloudy: Rob
 
 
 def test_a_client_publishes_as_much_as_rosbridge_takes(client: Client) -> None:
-    """A message of nearly 10 MB reaches the robot's graph, and comes back from it."""
+    """A message of nearly 10 MB reaches the robot's graph, and returns from it."""
     data = bytes(range(256)) * 28_000
     client.send(op="advertise", topic="/picture", type="sensor_msgs/msg/Image")
     client.send(op="subscribe", topic="/picture", type="sensor_msgs/msg/Image", compression="cbor")
@@ -83,7 +86,7 @@ def test_a_client_publishes_as_much_as_rosbridge_takes(client: Client) -> None:
     }
     heard = None
     for _ in range(20):
-        # Until the publisher and the subscription have found each other.
+        # Until DDS has matched publisher and subscription.
         client.send(op="publish", topic="/picture", msg=message)
         with contextlib.suppress(TimeoutError):
             heard = cbor2.loads(client.connection.recv(timeout=3))["msg"]["data"]

@@ -11,13 +11,14 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from switchboard_client import Client
-from switchboard_http import ask
-from switchboard_proxy import ChaosProxy
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_speakers import LATCHED, Speakers, speakers
-from switchboard_waiting import wait_for
+
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.http_requests import ask
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.ros_peers import LATCHED, Speakers, speakers
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 STRING = "std_msgs/msg/String"
 
@@ -41,7 +42,7 @@ def clients(world: Any) -> Iterator[list[Client]]:
 
 
 def known(client: Client, topic: str, publishers: int) -> None:
-    """Wait until the relay knows that so many nodes publish."""
+    """Waits until the relay knows this many publishing nodes."""
 
     def has_them() -> bool:
         return len(client.call("/rosapi/publishers", {"topic": topic})["values"]["publishers"]) == publishers
@@ -55,7 +56,7 @@ def texts(client: Client, topic: str, count: int) -> list[str]:
 
 
 def rest(client: Client, topic: str, seconds: float = 1.0) -> list[str]:
-    """What else comes on a topic in this time; nothing, mostly."""
+    """Further messages on a topic in this time, usually none."""
     found, end = [], time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         try:
@@ -66,7 +67,7 @@ def rest(client: Client, topic: str, seconds: float = 1.0) -> list[str]:
 
 
 def test_every_publisher_has_its_last_one(nodes: Speakers, clients: list[Client]) -> None:
-    """A, B and C publish, C twice: each client gets the latest of each, once, and so does each further subscription."""
+    """A, B and C publish, C twice: each client and each further subscription gets the latest of each, once."""
     topic = "/static"
     first, late, _ = clients
     for name in ("a", "b", "c"):
@@ -104,8 +105,8 @@ def test_depth_of_each_publisher_counts(nodes: Speakers, clients: list[Client]) 
     assert sorted(texts(with_throttle, topic, 7))[-2:] == ["b3", "b4"]
 
 
-def test_what_a_gone_publisher_kept_is_gone(nodes: Speakers, clients: list[Client]) -> None:
-    """As in ROS 2 itself: clients that come later get only what the remaining ones keep."""
+def test_latched_samples_go_with_their_publisher(nodes: Speakers, clients: list[Client]) -> None:
+    """As in ROS 2: later clients get only the samples of remaining publishers."""
     topic = "/leaving"
     first, late, _ = clients
     for name in ("stays", "leaves"):
@@ -121,7 +122,7 @@ def test_what_a_gone_publisher_kept_is_gone(nodes: Speakers, clients: list[Clien
 
 
 def test_client_that_waits_gets_each_sample_once(nodes: Speakers, clients: list[Client]) -> None:
-    """However the subscription on the robot is made again when publishers appear: latched, volatile, best effort."""
+    """Even if new publishers change the robot's subscription: latched, volatile, best effort."""
     client = clients[0]
     topics = [f"/waited{number}" for number in range(8)]
     for topic in topics:
@@ -170,7 +171,7 @@ def test_recording_has_what_was_published_before_it(
 
 
 def test_broken_link_repeats_nothing(tmp_path: Path) -> None:
-    """The robot dials again: clients that stayed get what was published meanwhile, and nothing that they have had."""
+    """After a reconnection clients get only samples published meanwhile."""
     topics = ("/one", "/two")
     relay = Relay(tmp_path)
     with ExitStack() as stack:
@@ -191,7 +192,7 @@ def test_broken_link_repeats_nothing(tmp_path: Path) -> None:
             assert texts(client, topic, 1) == ["kept"]
         for number in range(3):
             proxy.reset()
-            # It can come by a new link alone.
+            # It can only arrive on a new link.
             nodes.publish("a", topics[0], f"meanwhile {number}")
             assert texts(client, topics[0], 1) == [f"meanwhile {number}"]
         assert rest(client, topics[1]) == rest(client, topics[0]) == []
@@ -201,7 +202,7 @@ def test_broken_link_repeats_nothing(tmp_path: Path) -> None:
 
 
 def test_latched_publisher_among_others(nodes: Speakers, clients: list[Client]) -> None:
-    """One volatile publisher on the topic does not hide what the others keep."""
+    """A volatile publisher on the topic does not hide the latched samples of others."""
     topic = "/mixed"
     nodes.publish("volatile", topic, depth=5)
     nodes.publish("latched", topic, "kept")

@@ -1,4 +1,4 @@
-"""A test run that is killed leaves nothing behind."""
+"""A killed test run leaves neither processes nor files."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import switchboard_processes
-from switchboard_waiting import wait_for
+from tests.worlds import processes
+from tests.worlds.waiting import wait_for
 
-HARNESS = Path(switchboard_processes.__file__).parent
+ROOT = Path(processes.__file__).parents[2]
 STARTER = """
 import sys
 from pathlib import Path
-from switchboard_processes import Process
+from tests.worlds.processes import Process
 child = "import time; print('READY', flush=True); time.sleep(600)"
 started = Process([sys.executable, "-c", child], Path(sys.argv[1]), "child")
 started.wait_to_say("READY")
@@ -23,8 +23,7 @@ started.popen.wait()
 
 
 def test_a_killed_test_run_takes_its_processes_along(tmp_path: Path) -> None:
-    """What the harness started ends when the process that started it is killed by SIGKILL."""
-    path = ":".join([str(HARNESS), *filter(None, sys.path)])
+    path = ":".join([str(ROOT), *filter(None, sys.path)])
     starter = subprocess.Popen(
         [sys.executable, "-c", STARTER, str(tmp_path)],
         stdout=subprocess.PIPE,
@@ -42,7 +41,7 @@ def test_a_killed_test_run_takes_its_processes_along(tmp_path: Path) -> None:
 
 
 def _runs(status: Path) -> bool:
-    """Whether there is such a process and it is no zombie; orphans are reaped by whoever adopts them."""
+    """Whether the process exists and is no zombie; the adopter of an orphan may reap it late."""
     try:
         return status.read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:

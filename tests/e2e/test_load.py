@@ -1,4 +1,4 @@
-"""Ten seconds of load from a real ROS 2 publisher: what is promised holds, and nothing grows."""
+"""10 s of load from a real ROS 2 publisher: the guarantees hold, and memory does not grow."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_load import STRING, Counter, Publisher, Stalled, meter_of, status_of
-from switchboard_pulse import Pulse
-from switchboard_waiting import wait_for
 
 from relay_protocol.limits import MIB
+from tests.worlds.machine_pauses import Pulse
+from tests.worlds.ros_load import STRING, Counter, Publisher, Stalled, meter_of, status_of
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 SECONDS = 12.0
 RATE = 1000.0
@@ -22,7 +22,7 @@ FAST, THROTTLED = "fast-reader", "throttled-reader"
 
 @dataclass
 class Run:
-    """What was seen while the publisher was at work."""
+    """Observations while the publisher was active."""
 
     sent: dict[str, Any] = field(default_factory=dict)
     fast: Counter | None = None
@@ -41,9 +41,9 @@ class Run:
 
 @pytest.fixture(scope="module")
 def run(world: Any) -> Iterator[Run]:
-    """One run for all: a fast client, a throttled one, one that stalls, and one that comes late."""
+    """One run for all: a fast client, a throttled one, one that stalls, and a late one."""
     relay, robot = world.relay, world.robot
-    # Of their own, so that no other test's connection is taken for theirs.
+    # With its own user, so that connections of other tests do not count.
     staller, fast_one, throttled_one = (relay.user(name) for name in ("staller", FAST, THROTTLED))
     for name in ("staller", FAST, THROTTLED):
         relay.cli("right", "grant", name, "rover", "viewer")
@@ -83,8 +83,8 @@ def run(world: Any) -> Iterator[Run]:
         publisher.stop()
 
 
-def test_who_was_there_before_the_publisher_loses_nothing(world: Any) -> None:
-    """The robot's subscription changes to what the new publisher offers without a gap and without a repetition."""
+def test_early_subscriber_loses_no_message(world: Any) -> None:
+    """The robot's subscription changes to the new publisher's QoS without loss and without repetition."""
     counter = Counter(
         world.relay.connect("rover", world.viewer), dict.fromkeys(("small", "big", "unsure", "burst"), 0)
     )
@@ -101,19 +101,19 @@ def test_who_was_there_before_the_publisher_loses_nothing(world: Any) -> None:
 
 
 def latched_of(client: Client) -> str:
-    """What a late joiner gets of the latched topic."""
+    """The latched samples that a late subscriber gets."""
     client.send(op="subscribe", topic="/load/latched", type=STRING)
     return str(client.until(op="publish", topic="/load/latched")["msg"]["data"])
 
 
 def test_the_publisher_was_as_fast_as_asked(run: Run) -> None:
-    """A thousand messages a second left the publisher, so what follows was measured under that load."""
+    """It published a thousand messages a second, so the other tests measure that load."""
     assert run.sent["small"] / run.sent["seconds"] > 0.9 * RATE
 
 
 @pytest.mark.parametrize("name", ["small", "big"])
-def test_nothing_is_lost_and_the_order_is_kept(run: Run, name: str) -> None:
-    """From the first message that came to the last that was sent, every number is there, in order."""
+def test_all_bytes_arrive_in_order(run: Run, name: str) -> None:
+    """From the first received message to the last sent one, every number is there, in order."""
     assert run.fast is not None
     assert run.fast.broken == ""
     assert run.fast.lost(name) == []
@@ -121,15 +121,15 @@ def test_nothing_is_lost_and_the_order_is_kept(run: Run, name: str) -> None:
     assert len(run.fast.numbers[name]) > 0.8 * run.sent[name]
 
 
-def test_a_best_effort_publisher_is_heard(run: Run) -> None:
-    """A publisher that is not reliable is subscribed to as it offers, and comes through in order."""
+def test_a_best_effort_publisher_is_received(run: Run) -> None:
+    """The subscription matches its QoS, and messages arrive in order."""
     assert run.fast is not None
     assert run.fast.in_order("unsure")
     assert len(run.fast.numbers["unsure"]) > 0.5 * run.sent["unsure"]
 
 
 def test_a_throttled_client_gets_few_and_always_the_last(run: Run) -> None:
-    """At most two a second with ``throttle_rate`` 500, in order, and the last message of all arrives."""
+    """At most two a second with ``throttle_rate`` 500, in order, and the very last message arrives."""
     assert run.throttled is not None
     assert run.throttled.in_order("small")
     assert len(run.throttled.numbers["small"]) <= 2 * run.sent["seconds"] + 3
@@ -137,19 +137,19 @@ def test_a_throttled_client_gets_few_and_always_the_last(run: Run) -> None:
 
 
 def test_the_last_of_a_burst_passes_the_throttle_of_the_robot(run: Run) -> None:
-    """Where nobody wants more, the robot itself throttles, and sends the last of a burst."""
+    """With throttled clients only, the robot throttles itself, and sends the last of a burst."""
     assert run.throttled is not None
     assert run.throttled.last("burst") == run.sent["burst"] - 1
     assert len(run.throttled.numbers["burst"]) < 20
 
 
 def test_a_late_joiner_gets_what_was_latched(run: Run) -> None:
-    """Published once, before anybody came, and still there for who subscribes at the end."""
+    """It was published once, before any subscription, and is still sent at the end."""
     assert run.latched.startswith("000000000 ")
 
 
-def test_a_client_that_takes_nothing_is_cut_and_costs_little(run: Run) -> None:
-    """It is let go after some seconds, having cost less than 8 MiB; the fast client beside it lost nothing."""
+def test_a_client_that_reads_nothing_is_cut_and_costs_little(run: Run) -> None:
+    """It is cut after some seconds, at a cost of less than 8 MiB; the fast client lost no message."""
     assert 4 < run.cut_after < 15 + run.held_up
     assert run.stalled_ended
     assert run.memory_most["relay"] - run.memory_warm["relay"] < 8 * MIB
@@ -166,5 +166,5 @@ def test_queues_are_empty_at_the_end_and_nothing_was_dropped(run: Run) -> None:
 
 @pytest.mark.parametrize("process", ["relay", "daemon"])
 def test_memory_stays_level(run: Run, process: str) -> None:
-    """Ten thousand messages later the process is as large as it was when it had warmed up."""
+    """After ten thousand messages the process has its size of the beginning."""
     assert run.memory_end[process] - run.memory_warm[process] < 8 * MIB

@@ -1,4 +1,4 @@
-"""Guessing at a password from many networks."""
+"""Guesses at a password from many networks."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from switchboard_relay import Relay
-
-from relay_server.auth.login_limiter import FAILURES_OF_ACCOUNT
+from relay_server.auth.account_limit import FAILURES_OF_ACCOUNT
+from tests.worlds.relay_process import Relay
 
 NETWORKS, EACH = 15, 10
 HOME, ABROAD = "127.0.0.200", "127.0.0.201"
@@ -22,7 +21,7 @@ HOME, ABROAD = "127.0.0.200", "127.0.0.201"
 def tries(
     relay: Relay, user: str, password: str, source: str, path: str = "/api/v1/session"
 ) -> tuple[int, str]:
-    """Log in from there; status and body without the seconds to wait."""
+    """Logs in from an address; returns status and body without the seconds to wait."""
     connection = http.client.HTTPConnection(
         "127.0.0.1", relay.http_port, timeout=60, source_address=(source, 0)
     )
@@ -38,7 +37,7 @@ def tries(
 
 
 def guesses(relay: Relay, user: str, path: str = "/api/v1/session") -> list[tuple[int, str]]:
-    """What 150 guesses from 15 networks are answered."""
+    """Answers to 150 guesses from 15 networks."""
     return [
         tries(relay, user, f"guess{number}", f"127.0.0.{network + 2}", path)
         for network in range(NETWORKS)
@@ -46,9 +45,9 @@ def guesses(relay: Relay, user: str, path: str = "/api/v1/session") -> list[tupl
     ]
 
 
-def test_many_networks_get_no_more_guesses_and_lock_nobody_out(tmp_path: Path) -> None:
-    """An account that is not there is answered the same; its owner goes on from where they have logged in before, also
-    after the relay was started again.
+def test_many_networks_get_no_more_guesses_and_lock_no_user_out(tmp_path: Path) -> None:
+    """An unknown account gets the same answers; its owner can log in from known networks, even after a
+    restart of the relay.
     """
     relay = Relay(tmp_path)
     try:

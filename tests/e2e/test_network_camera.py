@@ -1,4 +1,4 @@
-"""A camera of the network, without ROS, from its RTSP to those who watch: real relay, daemon and camera process."""
+"""A network camera without ROS, from its RTSP to viewers: real relay, daemon and camera process."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ import cv2
 import numpy as np
 import psutil
 import pytest
-from switchboard_http import Answer, ask
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_rtsp import HEIGHT, WIDTH, RtspCamera
-from switchboard_waiting import wait_for
+
+from tests.worlds.http_requests import Answer, ask
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.rtsp_camera import HEIGHT, WIDTH, RtspCamera
+from tests.worlds.waiting import wait_for
 
 LOGIN = "ann:s3cret"
 SECRETS = ("s3cret", "rtsp:", "/front")
-GONE = "camera /gate gives no pictures; it is tried again"
-BACK = "camera /gate gives pictures again"
+GONE = "camera /gate delivers no frames; trying again"
+BACK = "camera /gate delivers frames again"
 
 
 class Gate(NamedTuple):
-    """A relay, a robot with that camera alone, and who may see it."""
+    """A relay, a robot with only that camera, and a viewer."""
 
     relay: Relay
     robot: Robot
@@ -46,12 +47,12 @@ class Gate(NamedTuple):
         return cv2.VideoCapture(address, cv2.CAP_FFMPEG)
 
     def cameras(self) -> list[dict[str, Any]]:
-        """Those the relay knows."""
+        """Cameras that the relay knows."""
         return list(self.get("cameras").json["cameras"])
 
     @property
     def log(self) -> str:
-        """The daemon's."""
+        """The daemon's log."""
         return self.robot.daemon.log.read_text()
 
 
@@ -73,7 +74,7 @@ def gate(tmp_path: Path) -> Iterator[Gate]:
 
 
 def check(pixels: Any) -> None:
-    """See whether this is the camera's picture: a red square in the upper left corner of a grey one."""
+    """Checks the camera's picture: a red square in the upper left corner of a grey image."""
     assert pixels.shape == (HEIGHT, WIDTH, 3)
     blue, green, red = pixels[10 : HEIGHT // 2 - 10, 10 : WIDTH // 2 - 10].mean((0, 1))
     assert red > 180 and max(blue, green) < 40
@@ -82,8 +83,8 @@ def check(pixels: Any) -> None:
 
 
 def test_a_camera_of_the_network_is_shown_and_found_again(gate: Gate) -> None:
-    """Its pictures come, as a snapshot and as a stream. When it is away who asks anew is told so, and a stream goes on
-    by itself when it is back. Who watches learns neither its address nor its password, and no log does.
+    """Its frames arrive as a snapshot and as a stream. While it is away new requests get an error, and a
+    stream continues when it returns. Neither viewers nor logs contain its address or password.
     """
     snapshot = gate.get("snapshot")
     assert snapshot.status == 200
@@ -103,10 +104,10 @@ def test_a_camera_of_the_network_is_shown_and_found_again(gate: Gate) -> None:
 
         gate.camera.close()
         wait_for("its absence is told", lambda: GONE in gate.log)
-        # For half a second the last picture is as good as a new one.
+        # For 0.5 s the last frame counts as new.
         while (late := gate.get("snapshot")).status == 200:
             pass
-        assert (late.status, late.json["detail"]) == (504, "camera /gate has given no picture for 10 s")
+        assert (late.status, late.json["detail"]) == (504, "camera /gate has sent no frame for 10 s")
         assert gate.log.count(GONE) == 1
         with closing(RtspCamera(gate.camera.port, LOGIN)):
             wait_for("its return is told", lambda: BACK in gate.log)
@@ -119,7 +120,7 @@ def test_a_camera_of_the_network_is_shown_and_found_again(gate: Gate) -> None:
                 status = client.until(op="publish", topic="/relay/status")
     finally:
         player.release()
-    told = [json.dumps(each) for each in (seen, status, commands)]
+    reported = [json.dumps(each) for each in (seen, status, commands)]
     for secret in SECRETS:
-        assert not [each for each in (*told, gate.relay.log) if secret in each]
+        assert not [each for each in (*reported, gate.relay.log) if secret in each]
     assert "s3cret" not in gate.log

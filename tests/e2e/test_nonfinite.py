@@ -1,4 +1,4 @@
-"""NaN and infinity as Python's ``json`` writes them, to the robot's graph and back."""
+"""NaN and infinity in the form of Python's ``json``, to the robot's graph and back."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from typing import Any
 
 import cbor2
 import pytest
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment, running
-from switchboard_waiting import PATIENCE, wait_for
+
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import PATIENCE, wait_for
 
 PEERS = Path(__file__).parent / "clients"
 NESTED = "switchboard_test_interfaces/msg/Nested"
@@ -29,7 +30,7 @@ MESSAGE: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def peer(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A node that serves and acts with every kind of field, and one with parameters."""
+    """A node with services and actions of every kind of field, and one with parameters."""
     environment = ros_environment(world.robot.domain)
     folder = tmp_path_factory.mktemp("peers")
     serving = Process(
@@ -43,7 +44,7 @@ def peer(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 
 
 def next_binary(client: Client) -> Any:
-    """The next message that is CBOR."""
+    """The next CBOR message."""
     end = time.monotonic() + PATIENCE
     while True:
         message = client.connection.recv(timeout=max(0.01, end - time.monotonic()))
@@ -58,17 +59,17 @@ def floats(array: Any) -> list[float]:
 
 
 def same(found: list[float], wanted: list[float]) -> bool:
-    """Whether the numbers are the same, NaN counting as equal to itself."""
+    """Whether the numbers are equal, NaN included."""
     return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(found, wanted, strict=True))
 
 
 def test_a_message_has_them_in_every_field_of_floats(world: Any) -> None:
-    """Single values, arrays, sequences and nested messages arrive as what they are."""
+    """Single values, arrays, sequences and nested messages arrive unchanged."""
     assert "NaN" in json.dumps(MESSAGE)
     with world.operating() as client:
         client.send(op="advertise", topic="/nonfinite", type=NESTED)
         client.send(op="subscribe", topic="/nonfinite", type=NESTED, compression="cbor")
-        # Until publisher and subscription have found each other.
+        # Until DDS has matched publisher and subscription.
         for _ in range(200):
             client.send(op="publish", topic="/nonfinite", msg=MESSAGE)
             try:
@@ -86,13 +87,12 @@ def test_a_message_has_them_in_every_field_of_floats(world: Any) -> None:
 
 
 def test_they_are_arguments_of_a_call_and_a_goal(world: Any, peer: None) -> None:
-    """The answer, the feedback and the result say them as null."""
+    """The answer, the feedback and the result have them as null."""
     with world.operating() as client:
-        wait_for(
-            "the service is there",
-            lambda: "/everything" in client.call("/rosapi/services")["values"]["services"],
-        )
-        values = client.call("/everything", {"request": MESSAGE, "words": []})["values"]
+        wait_for("the service responds", lambda: client.call("/everything")["result"])
+        response = client.call("/everything", {"request": MESSAGE, "words": []})
+        assert response["result"], response
+        values = response["values"]
         assert values["response"]["primitives"]["single"] is None
         assert values["response"]["pose"]["covariance"] == [None] * 36
         client.send(
@@ -112,7 +112,7 @@ def test_they_are_arguments_of_a_call_and_a_goal(world: Any, peer: None) -> None
 def test_a_parameter_that_is_nan_is_set_back_as_it_was_read(
     world: Any, peer: None, service: str, answer: str
 ) -> None:
-    """As Python writes it, and as it is read."""
+    """In Python's form, and as it is read."""
     with world.operating() as client:
         written = json.dumps(json.loads(answer.replace("null", "NaN")))
         wait_for(
@@ -127,8 +127,8 @@ def test_a_parameter_that_is_nan_is_set_back_as_it_was_read(
             assert client.call("/rosapi/get_param", {"name": service})["values"]["value"] == expected
 
 
-def test_elsewhere_they_are_refused_in_words_and_cut_nobody(world: Any) -> None:
-    """Far more than the hundred messages that are no rosbridge."""
+def test_elsewhere_they_are_refused_without_a_disconnect(world: Any) -> None:
+    """After many more than a hundred such messages."""
     with world.operating() as client:
         for number in range(120):
             client.send(
@@ -138,7 +138,7 @@ def test_elsewhere_they_are_refused_in_words_and_cut_nobody(world: Any) -> None:
             assert words == "publish /nonfinite_int: std_msgs/msg/Int32: data must be an integer, not NaN"
             client.send(op="subscribe", id=number, topic="/chatter", throttle_rate=INF)
             words = client.until(op="status", id=number)["msg"]
-            assert words.startswith("throttle_rate: NaN and infinity are no JSON")
+            assert words.startswith("throttle_rate: NaN and infinity are not JSON")
         client.send(op="call_service", id="own", service="/rosapi/topics", args={"x": -INF})
         assert client.until(op="service_response", id="own")["values"].startswith(
             "NaN and infinity are no arguments"

@@ -7,18 +7,19 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_http import ask
-from switchboard_waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from tests.worlds.http_requests import ask
+from tests.worlds.waiting import wait_for
 
 SCOPE = "viewer@rover"
 
 
 @pytest.fixture(scope="module")
-def program(world: Any) -> Any:
-    """A program of the operator's, for no more than what its scope says."""
+def oauth_client(world: Any) -> Any:
+    """An OAuth client of the operator, limited to its scope."""
     return world.relay.cli(
-        "program", "add", "operator", "--scope", f"{SCOPE} call:/reset", "--label", "reader"
+        "oauth-client", "add", "operator", "--scope", f"{SCOPE} call:/reset", "--label", "reader"
     )
 
 
@@ -29,22 +30,22 @@ def http(world: Any) -> Iterator[httpx.Client]:
         yield client
 
 
-def by_digest(http: httpx.Client, program: Any, **fields: str) -> httpx.Response:
-    """A token for the program, who proves itself by Digest."""
-    auth = httpx.DigestAuth(program["key"], program["secret"])
+def by_digest(http: httpx.Client, oauth_client: Any, **fields: str) -> httpx.Response:
+    """A token for the OAuth client, which authenticates by Digest."""
+    auth = httpx.DigestAuth(oauth_client["key"], oauth_client["secret"])
     return http.post("/oauth/token", data={"grant_type": "client_credentials", **fields}, auth=auth)
 
 
-def test_a_program_proves_itself_by_digest_and_reads_the_robot(
-    world: Any, http: httpx.Client, program: Any
+def test_an_oauth_client_proves_itself_by_digest_and_reads_the_robot(
+    world: Any, http: httpx.Client, oauth_client: Any
 ) -> None:
-    """Its secret is not sent, and its token opens what its scope says: it hears the robot and does not move it."""
+    """Its secret is not sent. Its token follows the scope: it reads the robot and does not move it."""
     challenge = http.post("/oauth/token")
     assert challenge.status_code == 401
     assert "algorithm=SHA-256" in challenge.headers.get_list("www-authenticate")[0]
-    # With an empty body curl asks, too, before it answers.
+    # With an empty body curl also asks before it answers.
     assert challenge.json()["error"] == "invalid_client"
-    token = by_digest(http, program).json()["access_token"]
+    token = by_digest(http, oauth_client).json()["access_token"]
     with world.relay.connect("rover", token) as client:
         client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
         client.until(op="publish", topic="/odom")
@@ -53,9 +54,11 @@ def test_a_program_proves_itself_by_digest_and_reads_the_robot(
         assert "outside the scope of your token" in client.until(op="status")["msg"]
 
 
-def test_a_token_does_not_show_robots_outside_its_scope(world: Any, http: httpx.Client, program: Any) -> None:
-    """They answer as robots do that are not there."""
-    token = by_digest(http, program, scope="viewer@rov*").json()
+def test_a_token_does_not_show_robots_outside_its_scope(
+    world: Any, http: httpx.Client, oauth_client: Any
+) -> None:
+    """The answers equal those for missing robots."""
+    token = by_digest(http, oauth_client, scope="viewer@rov*").json()
     assert token["error"] == "invalid_scope"
     narrow = world.relay.cli("token", "create", "operator", "--scope", "viewer@elsewhere")["token"]
     with pytest.raises(InvalidStatus) as caught:
@@ -67,8 +70,10 @@ def test_a_token_does_not_show_robots_outside_its_scope(world: Any, http: httpx.
     }
 
 
-def test_a_person_logs_in_goes_on_and_leaves(world: Any, http: httpx.Client) -> None:
-    """A password gives two tokens; the second gives the next two; revoking it cuts what is open."""
+def test_a_user_logs_in_refreshes_and_logs_out(world: Any, http: httpx.Client) -> None:
+    """A password returns two tokens; the refresh token returns the next two; revoking it cuts open
+    connections.
+    """
     said = {"grant_type": "password", "username": "viewer", "password": "correct horse"}
     first = http.post("/oauth/token", data=said).json()
     second = http.post(
@@ -89,13 +94,13 @@ def test_a_person_logs_in_goes_on_and_leaves(world: Any, http: httpx.Client) -> 
     assert left == {"active": False}
 
 
-def test_a_program_that_is_revoked_is_cut(world: Any, http: httpx.Client) -> None:
+def test_an_oauth_client_that_is_revoked_is_cut(world: Any, http: httpx.Client) -> None:
     """With all its tokens, at once."""
-    made = world.relay.cli("program", "add", "viewer")
+    made = world.relay.cli("oauth-client", "add", "viewer")
     token = by_digest(http, made).json()["access_token"]
     with world.relay.connect("rover", token) as client:
         client.call("/relay/ping")
-        world.relay.cli("program", "revoke", str(made["id"]))
+        world.relay.cli("oauth-client", "revoke", str(made["id"]))
         with pytest.raises(ConnectionClosed):
             while True:
                 client.receive()
@@ -119,18 +124,18 @@ def test_a_program_that_is_revoked_is_cut(world: Any, http: httpx.Client) -> Non
         (b"client_id=a&client_secret=b", "application/x-www-form-urlencoded", 401, "invalid_client"),
     ],
 )
-def test_what_can_not_be_read_is_refused_in_words(
+def test_unreadable_request_is_refused_with_a_reason(
     http: httpx.Client, body: bytes, kind: str, status: int, error: str
 ) -> None:
-    """In those of RFC 6749 section 5.2, never to be cached."""
+    """With codes of RFC 6749 section 5.2, never to be cached."""
     answer = http.post("/oauth/token", content=body, headers={"content-type": kind})
     assert (answer.status_code, answer.json()["error"]) == (status, error)
     assert answer.json()["error_description"]
     assert answer.headers["cache-control"] == "no-store"
 
 
-def test_other_ways_in_are_none(world: Any, http: httpx.Client) -> None:
-    """No cookie, no other method, and nobody asks about tokens without one of his own."""
+def test_other_credentials_are_refused(world: Any, http: httpx.Client) -> None:
+    """Cookies and other methods are refused, and introspection needs credentials."""
     assert http.get("/oauth/token").status_code == 405
     assert http.post("/oauth/elsewhere").status_code == 404
     assert http.post("/oauth/introspect", data={"token": world.viewer}).status_code == 401
@@ -140,7 +145,7 @@ def test_other_ways_in_are_none(world: Any, http: httpx.Client) -> None:
 
 
 def test_rules_of_alerts_take_a_token_for_everything(world: Any) -> None:
-    """One for a single robot must not have all the others' alerts sent somewhere."""
+    """A token for a single robot must not send alerts of all others elsewhere."""
     narrow = world.relay.cli("token", "create", "operator", "--scope", "owner@rover")["token"]
     port = world.relay.http_port
     for method, path in (
@@ -153,6 +158,6 @@ def test_rules_of_alerts_take_a_token_for_everything(world: Any) -> None:
         answer = ask(port, method, path, body, token=narrow)
         assert (answer.status, answer.json["detail"]) == (
             403,
-            "this takes a token without a scope: for all that you may",
+            "this needs an access token without a scope",
         )
     assert ask(port, "GET", "/api/v1/alerts/rules", token=world.operator).status == 200

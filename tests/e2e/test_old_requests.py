@@ -1,4 +1,4 @@
-"""No call and no goal from before a stall moves the robot after it, wherever it was held up."""
+"""No call and no goal from before a stall moves the robot after it, wherever it was delayed."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_http import Answer, ask
-from switchboard_processes import ros_environment
-from switchboard_proxy import ChaosProxy
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
 
 from tests.robot_client.ros import Peer
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.http_requests import Answer, ask
+from tests.worlds.processes import ros_environment
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
-MOMENT = "switchboard-moment"
+MOMENT = "switchboard-freshness"
 
 STALL_SECONDS = 0.9
 """Longer than the deadline of commands, shorter than what a link is given up for."""
 
 
-class Place:
-    """A relay, a robot whose service ``/reset`` and action ``/counts`` move it, a driver; proxies between them."""
+class ControlWorld:
+    """A relay, a robot whose service ``/reset`` and action ``/counts`` move it, a driver; proxies between
+    them.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.relay = Relay(folder)
@@ -45,7 +47,7 @@ class Place:
         self._threads = ThreadPoolExecutor(1)
 
     def connect(self) -> Client:
-        """The driver, who has control and has had both done, so that nothing is waited for any more."""
+        """The driver, with control; both requests were done once, so that no further preparation is needed."""
         client = self.relay.connect_by(self.client_side.port, "rover", self._token)
         wait_for("he has control", lambda: client.call("/relay/take_control")["values"]["success"])
         wait_for("it is reset", lambda: call(client)["result"])
@@ -53,25 +55,24 @@ class Place:
         return client
 
     def ask(self, method: str, path: str, body: Any = None, moment: str = "", port: int = 0) -> Answer:
-        """A request of the owner's.
+        """A request of the owner.
 
-        :param port: where it goes, for another way than the short one
+        :param port: where to send it, such as a proxy
         """
         dated = {MOMENT: moment} if moment else {}
         port = port or self.relay.http_port
         return ask(port, method, f"/api/v1{path}", body, headers=dated, token=self.owner)
 
     def held_up(self, path: str, body: Any, moment: str) -> Future[Answer]:
-        """A request of the owner's that does not come through before the network is healed."""
+        """A request of the owner that does not arrive before the network works again."""
         self.client_side.forward_up.clear()
         return self._threads.submit(self.ask, "POST", path, body, moment, self.client_side.port)
 
     def resets(self) -> int:
-        """How often the robot was reset, by its own record."""
+        """The number of resets, by the robot's own log."""
         return len(self.robot.events("reset"))
 
     def stop(self) -> None:
-        """End everything."""
         self.robot_side.heal()
         self.client_side.heal()
         self._threads.shutdown()
@@ -83,9 +84,9 @@ class Place:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """One place for all; each test leaves it whole."""
-    made = Place(tmp_path_factory.mktemp("place"))
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlWorld]:
+    """One scene for all; each test leaves it intact."""
+    made = ControlWorld(tmp_path_factory.mktemp("scene"))
     try:
         yield made
     finally:
@@ -93,13 +94,13 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
 
 
 def send(client: Client) -> None:
-    """Ask for both."""
+    """Sends both requests."""
     client.send(op="call_service", id="call", service="/reset")
     client.send(op="send_action_goal", id="goal", action="/counts", args={"order": 3})
 
 
 def ends(client: Client) -> list[dict[str, Any]]:
-    """What comes of both."""
+    """The results of both."""
     found: dict[str, dict[str, Any]] = {}
     while len(found) < 2:
         message = client.receive()
@@ -109,28 +110,28 @@ def ends(client: Client) -> list[dict[str, Any]]:
 
 
 def call(client: Client) -> dict[str, Any]:
-    """One call that moves the robot; its answer."""
+    """A call that moves the robot; returns its answer."""
     return client.call("/reset")
 
 
 def pursue(client: Client) -> dict[str, Any]:
-    """One goal that moves the robot; its end."""
+    """A goal that moves the robot; returns its end."""
     client.send(op="send_action_goal", id="first", action="/counts", args={"order": 3})
     return client.until(op="action_result", id="first")
 
 
-def test_what_was_held_up_on_its_way_to_the_robot_is_refused_there(place: Place) -> None:
-    """It arrives, the robot says how old it may be, and does nothing; what is asked for then is done."""
-    with place.connect() as client:
-        before = place.resets()
-        place.robot_side.forward_down.clear()
+def test_delayed_command_is_refused_by_the_robot(scene: ControlWorld) -> None:
+    """The robot knows the maximum age and does nothing; later requests are executed."""
+    with scene.connect() as client:
+        before = scene.resets()
+        scene.robot_side.forward_down.clear()
         send(client)
         time.sleep(STALL_SECONDS)
-        place.robot_side.heal()
+        scene.robot_side.heal()
         for end in ends(client):
             assert end["result"] is False
             assert "none older than 500 ms is obeyed" in end["values"]
-        assert place.resets() == before
+        assert scene.resets() == before
         done = 0
 
         def both() -> bool:
@@ -141,74 +142,74 @@ def test_what_was_held_up_on_its_way_to_the_robot_is_refused_there(place: Place)
             return results == [True, True]
 
         wait_for("both are done that come in time", both)
-        wait_for("it was reset as often as it was told", lambda: place.resets() == before + done)
+        wait_for("it was reset as often as it was told", lambda: scene.resets() == before + done)
 
 
-def test_what_a_client_asks_for_that_answers_no_ping_is_refused_by_the_relay(place: Place) -> None:
-    """Its words come through, but when they were said nobody knows; after the stall all is well."""
-    with place.connect() as client:
-        before = place.resets()
-        place.client_side.forward_down.clear()
+def test_requests_of_a_client_that_answers_no_ping_are_refused(scene: ControlWorld) -> None:
+    """Its messages arrive, but their age is unknown; after the stall requests are executed again."""
+    with scene.connect() as client:
+        before = scene.resets()
+        scene.client_side.forward_down.clear()
         time.sleep(STALL_SECONDS)
         send(client)
         time.sleep(0.2)  # they reach the relay while no ping reaches the client
-        place.client_side.heal()
+        scene.client_side.heal()
         for end in ends(client):
             assert end["result"] is False
             assert "ms old, by the last ping answered" in end["values"]
-        assert place.resets() == before
+        assert scene.resets() == before
         wait_for("its pongs come again", lambda: call(client)["result"])
-        wait_for("it was reset once", lambda: place.resets() == before + 1)
+        wait_for("it was reset once", lambda: scene.resets() == before + 1)
 
 
-def test_an_order_to_many_that_was_held_up_moves_no_robot(place: Place) -> None:
-    """It is as old as the moment it gives back; without one it is none. What is given then is done."""
+def test_an_order_to_many_that_was_held_up_moves_no_robot(scene: ControlWorld) -> None:
+    """It is as old as its freshness token; without one it is refused. Later orders are executed."""
     order = {"robots": ["rover"], "do": "call", "service": "/reset"}
-    before = place.resets()
-    assert place.ask("POST", "/fleet", order).status == 428
-    held_up = place.held_up("/fleet", order, place.ask("GET", "/fleet/groups").headers[MOMENT])
+    before = scene.resets()
+    assert scene.ask("POST", "/fleet", order).status == 428
+    held_up = scene.held_up("/fleet", order, scene.ask("GET", "/fleet/groups").headers[MOMENT])
     time.sleep(STALL_SECONDS)
-    place.client_side.heal()
+    scene.client_side.heal()
     refused = held_up.result(60)
     assert (refused.status, refused.json["code"]) == (412, "too_old")
-    assert place.resets() == before
+    assert scene.resets() == before
 
     def given() -> bool:
-        answer = place.ask("POST", "/fleet", order, place.ask("GET", "/fleet/groups").headers[MOMENT])
+        answer = scene.ask("POST", "/fleet", order, scene.ask("GET", "/fleet/groups").headers[MOMENT])
         return answer.status == 200 and json.loads(answer.body.splitlines()[1])["ok"]
 
     wait_for("it is given in time", given)
-    assert place.resets() == before + 1
+    assert scene.resets() == before + 1
 
 
 @pytest.mark.parametrize("way", ["/robots/rover/resume", "/fleet", "/robots/rover/services/relay/resume"])
-def test_a_resume_that_was_held_up_does_not_lift_a_newer_stop(place: Place, way: str) -> None:
-    """Somebody has pressed STOP meanwhile: the robot stays stopped until somebody who has seen that resumes it."""
+def test_a_resume_that_was_held_up_does_not_lift_a_newer_stop(scene: ControlWorld, way: str) -> None:
+    """STOP was pressed meanwhile: the robot stays stopped until a user who has seen that resumes it."""
     body = {"robots": ["rover"], "do": "resume"} if way == "/fleet" else {}
-    assert place.ask("POST", way, body).status == 428
-    moment = place.ask("POST", "/robots/rover/stop", {"why": "smoke"}).headers[MOMENT]
-    held_up = place.held_up(way, body, moment)
-    assert place.ask("POST", "/robots/rover/stop", {"why": "a child"}).status == 200
-    place.client_side.heal()
-    assert "after you asked for this" in held_up.result(60).body.decode()
-    told = place.ask("GET", "/robots/rover/control")
-    assert told.json["stopped"]
-    # The connection that is kept for who calls services has pings of its own.
-    wait_for("it is resumed", lambda: place.ask("POST", way, body, told.headers[MOMENT]).status == 200)
-    assert place.ask("GET", "/robots/rover/control").json["stopped"] is None
+    assert scene.ask("POST", way, body).status == 428
+    moment = scene.ask("POST", "/robots/rover/stop", {"why": "smoke"}).headers[MOMENT]
+    held_up = scene.held_up(way, body, moment)
+    assert scene.ask("POST", "/robots/rover/stop", {"why": "a child"}).status == 200
+    scene.client_side.heal()
+    assert "after you sent this" in held_up.result(60).body.decode()
+    reported = scene.ask("GET", "/robots/rover/control")
+    assert reported.json["stopped"]
+    # The pooled connection for service calls has its own pings.
+    wait_for("it is resumed", lambda: scene.ask("POST", way, body, reported.headers[MOMENT]).status == 200)
+    assert scene.ask("GET", "/robots/rover/control").json["stopped"] is None
 
 
-def test_a_resume_by_websocket_that_was_held_up_does_not_lift_a_newer_stop(place: Place) -> None:
-    """By the pings that came back before it."""
-    with place.relay.connect_by(place.client_side.port, "rover", place.owner) as client:
-        assert place.ask("POST", "/robots/rover/stop", {"why": "smoke"}).status == 200
-        place.client_side.forward_up.clear()
+def test_a_resume_by_websocket_that_was_held_up_does_not_lift_a_newer_stop(scene: ControlWorld) -> None:
+    """By the pings that were answered before it."""
+    with scene.relay.connect_by(scene.client_side.port, "rover", scene.owner) as client:
+        assert scene.ask("POST", "/robots/rover/stop", {"why": "smoke"}).status == 200
+        scene.client_side.forward_up.clear()
         client.send(op="call_service", id="old", service="/relay/resume")
-        assert place.ask("POST", "/robots/rover/stop", {"why": "a child"}).status == 200
-        place.client_side.heal()
+        assert scene.ask("POST", "/robots/rover/stop", {"why": "a child"}).status == 200
+        scene.client_side.heal()
         refused = client.until(op="service_response", id="old")
         assert refused["result"] is False
-        assert "after you asked for this" in refused["values"]
-        assert place.ask("GET", "/robots/rover/control").json["stopped"]
+        assert "after you sent this" in refused["values"]
+        assert scene.ask("GET", "/robots/rover/control").json["stopped"]
         wait_for("she resumes it", lambda: client.call("/relay/resume")["result"])
-    assert place.ask("GET", "/robots/rover/control").json["stopped"] is None
+    assert scene.ask("GET", "/robots/rover/control").json["stopped"] is None

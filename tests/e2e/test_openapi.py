@@ -1,7 +1,8 @@
-"""The HTTP API against its own description: schemathesis asks a real relay with a robot all that is described.
+"""The HTTP API and its OpenAPI document: schemathesis calls all documented operations of a real relay with a
+robot.
 
-Left out is what has no end that one could wait for (streams, websockets, files; ``lasts`` says why of each), and what
-would have the relay send something to another machine.
+Endless answers are left out (streams, websockets, files; ``lasts`` has the reasons), and so are operations by
+which the relay sends to another machine.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import requests
 import schemathesis
@@ -23,14 +25,17 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
-from switchboard_http import ask
-from switchboard_relay import Relay
-from switchboard_small_robot import SmallRobot
-from switchboard_waiting import wait_for
 
+from relay_server.alerts.schemas import AlertsUpdate
+from relay_server.fleet.order import FleetOrderEnd, FleetOrderStart, FleetRobotResult
 from relay_server.http.openapi.document import document
 from relay_server.http.openapi.http import operations
 from relay_server.http.openapi.operation import Credential
+from relay_server.sessions.presence import RobotsUpdate
+from tests.worlds.http_requests import ask
+from tests.worlds.relay_process import Relay
+from tests.worlds.small_robot import SmallRobot
+from tests.worlds.waiting import wait_for
 
 EXAMPLES = 12
 """Requests of each operation by who owns the robot and administers the relay."""
@@ -48,12 +53,12 @@ IN_REALM = {
     "user": ["bob", "nobody"],
     "holder": ["bob", "@crew", "@nobody"],
     "member": ["arm", "nobody"],
-    "key": ["swp_nobody", "%"],
+    "key": ["swc_nobody", "%"],
     "robot": ["arm", "nobody"],
 }
 """Names in addresses of the realm."""
 
-MOMENT = "switchboard-moment"
+MOMENT = "switchboard-freshness"
 
 SHORT = 0.2
 """Longest that a request waits for something, seconds."""
@@ -65,51 +70,51 @@ def starts(robot: SmallRobot, args: Any) -> dict[str, Any]:
 
 
 def closed(schema: dict[str, Any]) -> dict[str, Any]:
-    """What is answered has no field that is not described."""
+    """Answers may have no undocumented fields."""
     return {**schema, "additionalProperties": False} if schema.get("properties") else schema
 
 
 def asked() -> dict[str, Any]:
-    """The description, narrowed to what a test can ask in its time; of answers nothing is left open."""
-    told = copy.deepcopy(document(operations(), "1", "session"))
+    """The OpenAPI document, limited to operations that a test can finish; the schemas of answers are closed."""
+    reported = copy.deepcopy(document(operations(), "1", "session"))
     sent: set[str] = set()
-    for path, methods in list(told["paths"].items()):
+    for path, methods in list(reported["paths"].items()):
         for method, each in list(methods.items()):
             if "x-lasts" in each:
                 del methods[method]
                 continue
             body = each.get("requestBody", {})
-            # RDF is written by hand in its own tests.
+            # RDF bodies are written by hand in their own tests.
             body.get("content", {}).pop("text/turtle", None)
             for media in ("application/rdf+xml", "application/ld+json"):
                 body.get("content", {}).pop(media, None)
             sent |= {
-                str(of["schema"].get("$ref", "")).rpartition("/")[2]
+                str(of.get("schema", {}).get("$ref", "")).rpartition("/")[2]
                 for of in body.get("content", {}).values()
             }
-            # Of all values none but the relay's own is a moment.
+            # Only the relay's own values are freshness tokens.
             given = [one for one in each.get("parameters", []) if one["name"] != MOMENT]
             each["parameters"] = given
             for parameter in given:
                 narrow(parameter)
                 if path.startswith("/api/v1/realm") and parameter["name"] in IN_REALM:
-                    # Not the user who asks, nor the robot that all others ask about.
+                    # Neither the requesting user nor the robot of all other requests.
                     parameter["schema"] = {"enum": IN_REALM[parameter["name"]]}
         if not methods:
-            del told["paths"][path]
-    schemas = told["components"]["schemas"]
+            del reported["paths"][path]
+    schemas = reported["components"]["schemas"]
     for name in schemas.keys() - sent - {"VideoSettings"}:
         schemas[name] = closed(schemas[name])
-    for name in ("Call", "Order"):
+    for name in ("ServiceCall", "Order"):
         schemas[name]["properties"]["timeout"]["maximum"] = SHORT
     schemas["Order"]["properties"]["robots"]["items"] = {"enum": ["rover", "r*", "nobody", "group:all"]}
-    # Nothing leaves the machine.
+    # No request leaves the machine.
     schemas["RuleRequest"]["properties"]["channel"] = {"enum": ["portal", "apprise", "pigeon"]}
-    return told
+    return reported
 
 
 def narrow(parameter: dict[str, Any]) -> None:
-    """Have a parameter name what there is, and wait for nothing."""
+    """Limits a parameter to existing names, and to no wait."""
     name = parameter["name"]
     if name == "robot" and parameter["in"] == "path":
         parameter["schema"] = {"enum": ["rover", "nobody"]}
@@ -122,11 +127,11 @@ def narrow(parameter: dict[str, Any]) -> None:
 
 
 @dataclass
-class House:
-    """A relay with a robot, somebody who owns it and administers the relay, and somebody who may only look.
+class World:
+    """A relay with a robot, an owner who administers the relay, and a viewer.
 
-    :ivar spare: a token that may end
-    :ivar viewers: of who may only look, and one that may end
+    :ivar spare: a token that may be revoked
+    :ivar viewers: the viewer's, and one that may be revoked
     """
 
     relay: Relay
@@ -137,12 +142,12 @@ class House:
 
     @property
     def url(self) -> str:
-        """Where the relay is."""
+        """The URL of the relay."""
         return f"http://127.0.0.1:{self.relay.http_port}"
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """One for all operations: none breaks it for the others."""
     relay = Relay(tmp_path_factory.mktemp("openapi"), "--requests-per-second", "0")
     try:
@@ -153,9 +158,9 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
         try:
             viewer = relay.user("vic")
             relay.cli("right", "grant", "vic", "rover", "viewer")
-            house = House(relay, token, relay.token("ann"), (viewer, relay.token("vic")))
-            yield house
-            house.session.close()
+            world = World(relay, token, relay.token("ann"), (viewer, relay.token("vic")))
+            yield world
+            world.session.close()
         finally:
             robot.goes()
     finally:
@@ -176,23 +181,23 @@ load_all_checks()
 
 @dataclass
 class Visit:
-    """Somebody who knows what there is, and gives back the moment of the latest answer."""
+    """A client that uses existing names and the latest freshness token."""
 
-    house: House
+    world: World
     moment: dict[str, str] = field(default_factory=dict)
 
     def __call__(self, method: str, path: str, body: Any = None, **named: str) -> Any:
-        """Ask for something, see that the answer is as described, and give what is in it.
+        """Sends a request, checks that the answer is documented, and returns its content.
 
-        :param named: what stands in the address
+        :param named: parts of the address
         """
         given = {} if body is None else {"body": body, "media_type": "application/json"}
         if path.startswith("/oauth"):
             given["media_type"] = "application/x-www-form-urlencoded"
         case = SCHEMA[path][method].Case(path_parameters={"robot": "rover", **named}, **given)
-        proof = {"Authorization": f"Bearer {self.house.token}"} if path != "/oauth/token" else {}
+        proof = {"Authorization": f"Bearer {self.world.token}"} if path != "/oauth/token" else {}
         answer = case.call(
-            base_url=self.house.url, headers={**proof, **self.moment}, session=self.house.session
+            base_url=self.world.url, headers={**proof, **self.moment}, session=self.world.session
         )
         assert answer.status_code < 300, answer.text
         if MOMENT in answer.headers:
@@ -201,9 +206,9 @@ class Visit:
         return answer.json() if answer.content else None
 
 
-def test_what_is_asked_rightly_is_answered_as_described(house: House) -> None:
-    """Alerts, rules, recordings, events, orders and tokens from their beginning to their end."""
-    visit, robot = Visit(house), "/api/v1/robots/{robot}"
+def test_valid_request_is_answered_as_described(world: World) -> None:
+    """Alerts, rules, recordings, events, orders and tokens from creation to removal."""
+    visit, robot = Visit(world), "/api/v1/robots/{robot}"
     visit("POST", f"{robot}/stop", {"why": "to be told"})
     wait_for("the alert is told", lambda: visit("GET", "/api/v1/alerts")["alerts"])
     alert = visit("GET", "/api/v1/alerts")["alerts"][0]
@@ -228,10 +233,14 @@ def test_what_is_asked_rightly_is_answered_as_described(house: House) -> None:
     assert start in visit("GET", f"{robot}/services")["services"] and start["types"]
     visit("POST", f"{robot}/topics/{{name}}", {"value": {"data": "dock"}}, name="mode")
     visit("POST", "/api/v1/tickets", {"robot": "rover", "for": "video", "camera": "/front"})
-    base = visit("GET", f"{robot}/modules/{{name}}", name="base")
-    assert base in visit("GET", f"{robot}/modules")["modules"] and base["subscribes"] == ["/mode"]
-    with house.relay.connect("rover", house.token):
+    base = visit("GET", f"{robot}/nodes/{{name}}", name="base")
+    assert base in visit("GET", f"{robot}/nodes")["nodes"] and base["subscribes"] == ["/mode"]
+    with world.relay.connect("rover", world.token):
         assert visit("GET", f"{robot}/people")["people"][0]["user"] == "ann"
+    urls = f"{robot}/foxglove-urls"
+    made = visit("POST", urls, {"label": "screen"})
+    assert [each["id"] for each in visit("GET", urls)["urls"]] == [made["id"]]
+    visit("DELETE", f"{urls}/{{id}}", id=made["id"])
     administer(visit, "/api/v1/realm")
     login = {"grant_type": "password", "username": "ann", "password": "correct horse"}
     token = visit("POST", "/oauth/token", login)["access_token"]
@@ -240,7 +249,7 @@ def test_what_is_asked_rightly_is_answered_as_described(house: House) -> None:
 
 
 def administer(visit: Visit, realm: str) -> None:
-    """All that there is in a realm, from its beginning to its end."""
+    """All kinds of resources of a realm, from creation to removal."""
     assert visit("GET", realm)["realm"] == "default"
     visit("POST", f"{realm}/users", {"name": "bob", "password": "correct horse"})
     assert visit("PATCH", f"{realm}/users/{{name}}", {"admin": True}, name="bob")["admin"]
@@ -262,12 +271,14 @@ def administer(visit: Visit, realm: str) -> None:
     assert [each["retired"] for each in keys] == [None]
     tokens = visit("GET", f"{realm}/users/{{name}}/tokens", name="ann")["tokens"]
     assert {"access"} <= {each["kind"] for each in tokens}
-    told = visit("PATCH", f"{realm}/robots/{{name}}", {"description": "on the bench"}, name="arm")
-    assert told["description"] == "on the bench"
-    programs = f"{realm}/users/{{name}}/programs"
-    program = visit("POST", programs, {"label": "reader", "scope": "viewer"}, name="bob")
-    assert program.pop("secret") and visit("GET", programs, name="bob")["programs"] == [program]
-    visit("DELETE", f"{realm}/programs/{{key}}", key=program["key"])
+    reported = visit("PATCH", f"{realm}/robots/{{name}}", {"description": "on the bench"}, name="arm")
+    assert reported["description"] == "on the bench"
+    oauth_clients = f"{realm}/users/{{name}}/oauth-clients"
+    oauth_client = visit("POST", oauth_clients, {"label": "reader", "scope": "viewer"}, name="bob")
+    assert oauth_client.pop("secret") and visit("GET", oauth_clients, name="bob")["oauth_clients"] == [
+        oauth_client
+    ]
+    visit("DELETE", f"{realm}/oauth-clients/{{key}}", key=oauth_client["key"])
     visit("POST", f"{realm}/robot-groups", {"name": "upstairs"})
     place = f"{realm}/robot-groups/{{name}}/members/{{member}}"
     visit("PUT", place, name="upstairs", member="arm")
@@ -282,7 +293,7 @@ def administer(visit: Visit, realm: str) -> None:
 
 
 def examples(most: int) -> settings:
-    """So many of each operation, always the same."""
+    """A fixed set of this many examples for each operation."""
     return settings(
         max_examples=most,
         derandomize=True,
@@ -292,53 +303,80 @@ def examples(most: int) -> settings:
     )
 
 
-def see_described(case: Any, house: House, token: str, spare: str) -> None:
-    """Ask, and see that the answer is one of those that are described.
+def see_described(case: Any, world: World, token: str, spare: str) -> None:
+    """Sends a request, and checks that the answer is documented.
 
-    :param spare: for what ends the token that is sent
+    :param spare: for operations that revoke the sent token
     """
     ends = (case.method, case.path) == ("DELETE", "/api/v1/session")
     headers = {"Authorization": f"Bearer {spare if ends else token}"}
-    answer = case.call(base_url=house.url, headers=headers, session=house.session)
+    answer = case.call(base_url=world.url, headers=headers, session=world.session)
     assert answer.status_code not in (500, 501, 502), answer.text
     case.validate_response(answer, checks=CHECKS)
 
 
 @SCHEMA.parametrize()
 @examples(EXAMPLES)
-def test_no_answer_is_undocumented(case: Any, house: House) -> None:
-    """Whatever is asked, right or wrong: no failure, no status, media type or field that is not described."""
-    see_described(case, house, house.token, house.spare)
+def test_no_answer_is_undocumented(case: Any, world: World) -> None:
+    """For valid and invalid requests: no failure, and no undocumented status, media type or field."""
+    see_described(case, world, world.token, world.spare)
 
 
 @SCHEMA.parametrize()
 @examples(FEWER)
-def test_no_refusal_is_undocumented(case: Any, house: House) -> None:
-    """Nor is what somebody is told who may only look."""
-    see_described(case, house, *house.viewers)
+def test_no_refusal_is_undocumented(case: Any, world: World) -> None:
+    """Nor are answers to a viewer."""
+    see_described(case, world, *world.viewers)
 
 
-def test_every_operation_has_its_address(house: House) -> None:
-    """Who proves nobody is told so, where something has to be proved; nowhere is nothing."""
+def test_live_updates_are_as_described(world: World) -> None:
+    types: dict[str, Any] = {"robots": RobotsUpdate, "alerts": AlertsUpdate}
+    headers = {"Authorization": f"Bearer {world.token}"}
+    received: dict[str, Any] = {}
+    with requests.get(f"{world.url}/api/v1/robots/stream", headers=headers, stream=True) as answer:
+        lines = filter(None, answer.iter_lines())
+        while received.keys() != types.keys():
+            event, data = (next(lines).partition(b": ")[2] for _ in range(2))
+            received[event.decode()] = msgspec.json.decode(data, type=types[event.decode()])
+    assert [each["name"] for each in received["robots"]["robots"]] == ["rover"]
+
+
+def test_lines_of_an_order_are_as_described(world: World) -> None:
+    headers = {"Authorization": f"Bearer {world.token}"}
+    order = {"robots": ["rover", "nobody"], "do": "stop"}
+    answer = requests.post(f"{world.url}/api/v1/fleet", json=order, headers=headers)
+    start, result, end = answer.content.splitlines()
+    assert msgspec.json.decode(start, type=FleetOrderStart).unmatched == ["nobody"]
+    assert msgspec.json.decode(result, type=FleetRobotResult).ok
+    assert msgspec.json.decode(end, type=FleetOrderEnd).ok == 1
+    visit = Visit(world)
+    # For a freshness token.
+    visit("GET", "/api/v1/robots/{robot}/control")
+    visit("POST", "/api/v1/robots/{robot}/resume", {})
+
+
+def test_every_operation_has_its_address(world: World) -> None:
+    """Unauthenticated requests get 401 if authentication is needed; no address is missing."""
     for each in operations():
-        # A word that there is; all else is asked about only by who has proved himself.
+        # An existing term; other requests need authentication.
         path = each.path.replace("{name}", "fields").replace("{", "").replace("}", "")
-        answer = ask(house.relay.http_port, each.method, path)
+        answer = ask(world.relay.http_port, each.method, path)
         assert answer.status not in (404, 405, 500), each
-        if each.credential in (Credential.USER, Credential.VIEWER, Credential.ASKER):
+        if each.credential in (Credential.USER, Credential.VIEWER, Credential.OAUTH_CLIENT_OR_USER):
             assert answer.status in (400, 401, 426), (each, answer.body)
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_the_page_is_for_phones_and_desks(browser: Browser, house: House, width: int) -> None:
-    """It needs nothing of other hosts, breaks no rule of the relay's policy, and is no wider than the screen, however
-    much of it is open."""
+def test_the_page_is_for_phones_and_desks(browser: Browser, world: World, width: int) -> None:
+    """It loads nothing from other hosts, violates no rule of the relay's policy, and fits the screen's width,
+    with any parts open.
+    """
     page = browser.new_page(viewport={"width": width, "height": 800})
     try:
         asked, said = list[str](), list[str]()
         page.on("request", lambda request: asked.append(request.url))
         page.on("console", lambda message: said.append(message.text))
-        page.goto(f"{house.url}/api/docs")
+        page.goto(f"{world.url}/api/docs")
         operation = page.locator("#post_robots_by_robot_stop")
         operation.locator("summary").click()
         expect(operation.get_by_text("application/problem+json").first).to_be_visible()
@@ -346,14 +384,14 @@ def test_the_page_is_for_phones_and_desks(browser: Browser, house: House, width:
         expect(page.locator("#type-StopAnswer")).to_be_visible()
         page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true })")
         assert page.evaluate("document.documentElement.scrollWidth") <= width
-        assert all(each.startswith(house.url) for each in asked)
+        assert all(each.startswith(world.url) for each in asked)
         assert not [each for each in said if "Content Security Policy" in each]
     finally:
         page.close()
 
 
 def test_requests_are_limited_and_stops_are_not(tmp_path: Path) -> None:
-    """With a real clock and a real robot: what is left is told, and a stop passes when nothing is."""
+    """With a real clock and a real robot: the remaining requests are shown, and a stop passes without any."""
     relay = Relay(tmp_path, "--requests-per-second", "0.01")
     try:
         token = relay.user("ann")

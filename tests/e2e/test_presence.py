@@ -1,4 +1,4 @@
-"""How good links are, and who is where: a real relay, and a robot whose network can be far away."""
+"""The quality of links, and connected users: a real relay, and a robot whose network can be slow."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_fake_robot import FakeRobot
-from switchboard_http import ask
-from switchboard_proxy import ChaosProxy
-from switchboard_relay import Relay
-from switchboard_waiting import wait_for
 
 from relay_protocol import link
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.fake_robot import FakeRobot
+from tests.worlds.http_requests import ask
+from tests.worlds.relay_process import Relay
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 KEY = bytes(range(32))
 FAR = 0.2
@@ -33,7 +33,7 @@ class Answering(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        """One message after the other."""
+        """Reads one message after the other."""
         try:
             while (message := self._robot.receive(30)) is not None:
                 if message["op"] == "ping":
@@ -44,7 +44,7 @@ class Answering(threading.Thread):
 
 @contextmanager
 def away(relay: Relay, proxy: ChaosProxy) -> Iterator[FakeRobot]:
-    """The robot ``faraway`` on the other side of a proxy."""
+    """The robot ``faraway`` behind a proxy."""
     with FakeRobot(proxy.port) as robot:
         assert robot.register("faraway", KEY)["op"] == "welcome"
         answering = Answering(robot)
@@ -84,29 +84,29 @@ def robot_link(relay: Relay) -> dict[str, Any]:
     return dict(robot["link"])
 
 
-def heard(client: Client) -> dict[str, Any]:
+def next_status(client: Client) -> dict[str, Any]:
     """The next ``/relay/status``."""
     return dict(client.until(op="publish", topic="/relay/status")["msg"])
 
 
-def told(client: Client, part: str, quality: str) -> dict[str, Any]:
-    """The first ``/relay/status`` in which a part of the way is of this quality."""
+def reported(client: Client, part: str, quality: str) -> dict[str, Any]:
+    """The first ``/relay/status`` with this quality for a part of the path."""
 
     def looked() -> dict[str, Any] | None:
-        status = heard(client)
+        status = next_status(client)
         return status if status["links"][part]["quality"] == quality else None
 
     return dict(wait_for(f"{part} is told to be {quality}", looked))
 
 
 def test_a_robot_that_is_far_away_is_seen_to_be(relay: Relay, proxy: ChaosProxy) -> None:
-    """The word goes from good to bad and back with the network, for everybody who is told, numbers with it."""
+    """The rating follows the network from good to bad and back, with its numbers, for all readers."""
     ann = relay.user("ann")
     relay.cli("right", "grant", "ann", "faraway", "viewer")
     with away(relay, proxy), relay.connect("faraway", ann) as client:
         client.send(op="subscribe", topic="/relay/status")
         wait_for("the link is good", lambda: robot_link(relay)["quality"] == "good")
-        near = told(client, "client_robot", "good")["links"]
+        near = reported(client, "client_robot", "good")["links"]
         assert near["client_relay"]["quality"] == near["relay_robot"]["quality"] == "good"
         assert near["client_robot"]["rtt_ms"] >= near["relay_robot"]["rtt_ms"]
 
@@ -114,8 +114,8 @@ def test_a_robot_that_is_far_away_is_seen_to_be(relay: Relay, proxy: ChaosProxy)
         wait_for("the link is bad", lambda: robot_link(relay)["quality"] == "bad")
 
         def seen_far() -> bool:
-            """Once nothing from before is counted any more, nor of a moment in which the machine stood still."""
-            links = heard(client)["links"]
+            """Once earlier values, and those of a stall of the machine, have left the window."""
+            links = next_status(client)["links"]
             near, away = links["client_relay"]["quality"], links["client_robot"]["quality"]
             p95_ms = links["relay_robot"]["p95_ms"]
             return (near, away) == ("good", "bad") and 2000 * FAR <= (p95_ms or 0) < 2000 * FAR + 500
@@ -126,16 +126,16 @@ def test_a_robot_that_is_far_away_is_seen_to_be(relay: Relay, proxy: ChaosProxy)
 
         proxy.seconds_away = 0.0
         wait_for("the link is good again", lambda: robot_link(relay)["quality"] == "good")
-        told(client, "client_robot", "good")
+        reported(client, "client_robot", "good")
 
         proxy.black_hole()
         wait_for("the link is lost", lambda: robot_link(relay)["quality"] in ("bad", "lost"))
-        told(client, "relay_robot", "lost")
+        reported(client, "relay_robot", "lost")
         proxy.heal()
 
 
-def test_people_are_told_to_who_has_a_right(relay: Relay, proxy: ChaosProxy) -> None:
-    """Their connections with where they are for owners; to a stranger the robot is not there."""
+def test_connected_users_are_shown_to_users_with_the_right(relay: Relay, proxy: ChaosProxy) -> None:
+    """Owners also see addresses; without a right the robot is not found."""
     ann, bob, eve = (relay.user(name) for name in ("ann", "bob", "eve"))
     relay.cli("right", "grant", "ann", "faraway", "owner")
     relay.cli("right", "grant", "bob", "faraway", "viewer")
@@ -158,16 +158,18 @@ def test_people_are_told_to_who_has_a_right(relay: Relay, proxy: ChaosProxy) -> 
         assert _addresses(people(bob).json) == {""}
         assert people(eve).status == 404
         one.send(op="subscribe", topic="/relay/status")
-        mine = [each for person in heard(one)["people"] for each in person["connections"] if each["you"]]
+        mine = [
+            each for person in next_status(one)["people"] for each in person["connections"] if each["you"]
+        ]
         assert len(mine) == 1
     wait_for("all have left", lambda: people(ann).json["people"] == [])
 
 
-def _addresses(told: dict[str, Any]) -> set[str]:
-    return {each["address"] for person in told["people"] for each in person["connections"]}
+def _addresses(reported: dict[str, Any]) -> set[str]:
+    return {each["address"] for person in reported["people"] for each in person["connections"]}
 
 
-def _measured(told: dict[str, Any], count: int) -> dict[str, Any] | None:
-    """What was told, once so many connections have a round trip to the robot."""
-    found = [each["robot_rtt_ms"] for person in told["people"] for each in person["connections"]]
-    return told if len(found) == count and None not in found else None
+def _measured(reported: dict[str, Any], count: int) -> dict[str, Any] | None:
+    """The report, once this many connections have a round trip to the robot."""
+    found = [each["robot_rtt_ms"] for person in reported["people"] for each in person["connections"]]
+    return reported if len(found) == count and None not in found else None

@@ -1,4 +1,6 @@
-"""Two realms on one relay: names stand in both, and nothing of one can be seen, reached or inferred from the other."""
+"""Two realms on one relay: both may use the same names, and neither can see, reach or infer resources of the
+other.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_http import ROBOT_BODIES, Answer, ask, log_in
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_small_robot import SmallRobot
-from switchboard_waiting import wait_for
 from websockets.exceptions import InvalidStatus
 
 from relay_server.http.openapi.document import document
 from relay_server.http.openapi.http import operations
+from tests.worlds.http_requests import ROBOT_BODIES, Answer, ask, log_in
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.small_robot import SmallRobot
+from tests.worlds.waiting import wait_for
 
 PASSWORD = "correct horse"
 LABS = ("lab1", "lab2")
 
 
-class Labs:
+class World:
     """A relay with two realms. Each has a robot ``mobile``, an operator ``toad`` and an administrator ``root``; the
     second also has a robot ``secret`` and a user ``mole``.
     """
@@ -43,25 +45,24 @@ class Labs:
         self.enter("secret@lab2")
 
     def enter(self, name: str) -> None:
-        """A robot that answers ``/where``, and dials in."""
+        """A robot that answers ``/where`` connects."""
         self.robots[name] = SmallRobot(self.relay, name, {"/where": lambda *_: {"message": name}}).comes()
 
     def ask(self, who: str, method: str, path: str, body: Any = None, **headers: str) -> Answer:
-        """What somebody is answered."""
+        """The answer to a user's request."""
         sent = {name.replace("_", "-"): value for name, value in headers.items()}
         return ask(self.relay.http_port, method, path, body, headers=sent, token=self.tokens[who])
 
     def stop(self) -> None:
-        """End everything."""
         for each in self.robots.values():
             each.goes()
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def labs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Labs]:
-    """Both of them, for all tests."""
-    made = Labs(tmp_path_factory.mktemp("realms"))
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """Both realms, for all tests."""
+    made = World(tmp_path_factory.mktemp("realms"))
     yield made
     made.stop()
 
@@ -70,59 +71,65 @@ def labs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Labs]:
 
 
 @pytest.mark.parametrize("lab", LABS)
-def test_a_name_means_what_it_is_in_ones_own_realm(labs: Labs, lab: str) -> None:
-    """Both toads call a service of ``mobile``, by websocket and over HTTP, and each is answered by his own robot."""
-    who, robot = f"toad@{lab}", labs.robots[f"mobile@{lab}"]
+def test_a_name_belongs_to_the_callers_realm(world: World, lab: str) -> None:
+    """Both toads call a service of ``mobile``, by websocket and over HTTP, and each reaches the robot of
+    their own realm.
+    """
+    who, robot = f"toad@{lab}", world.robots[f"mobile@{lab}"]
     before = len(robot.calls)
-    with labs.relay.connect("mobile", labs.tokens[who]) as client:
+    with world.relay.connect("mobile", world.tokens[who]) as client:
         assert client.call("/where")["values"]["message"] == f"mobile@{lab}"
-    answer = labs.ask(who, "POST", "/api/v1/robots/mobile/services/where", {})
+    answer = world.ask(who, "POST", "/api/v1/robots/mobile/services/where", {})
     assert (answer.status, answer.json["values"]["message"]) == (200, f"mobile@{lab}")
     assert len(robot.calls) == before + 2
 
 
 @pytest.mark.parametrize("lab", LABS)
-def test_everybody_sees_the_robots_of_his_realm(labs: Labs, lab: str) -> None:
-    """Its administrator all of them, an operator those he has a right on, and nobody one of another realm."""
+def test_users_see_the_robots_of_their_realm(world: World, lab: str) -> None:
+    """An administrator sees all of them, an operator those with a right; no user sees robots of another
+    realm.
+    """
     of_root = {"lab1": {"mobile"}, "lab2": {"mobile", "secret"}}[lab]
     for who, expected in ((f"root@{lab}", of_root), (f"toad@{lab}", {"mobile"})):
-        told = labs.ask(who, "GET", "/api/v1/robots").json["robots"]
-        assert {each["name"] for each in told} == expected
+        reported = world.ask(who, "GET", "/api/v1/robots").json["robots"]
+        assert {each["name"] for each in reported} == expected
 
 
-def test_a_name_without_a_realm_is_of_the_default_one(labs: Labs) -> None:
-    """There is no toad there, and the robot's operator is not let in by his bare name."""
-    port = labs.relay.http_port
+def test_a_name_without_a_realm_is_of_the_default_one(world: World) -> None:
+    """There is no toad in it, and the robot's operator cannot log in with the bare name."""
+    port = world.relay.http_port
     origin = {"Origin": f"http://127.0.0.1:{port}"}
     for user in ("toad", "toad@lab2x", "toad@", "toad@lab1@lab2"):
         body = {"user": user, "password": PASSWORD}
         answer = ask(port, "POST", "/api/v1/session", body, headers=origin)
         assert (answer.status, answer.json["code"]) == (401, "bad_credentials"), user
     cookie = log_in(port, "Toad@LAB1", PASSWORD)
-    told = ask(port, "GET", "/api/v1/session", headers={"Cookie": cookie, **origin}).json
-    assert (told["user"], told["realm"], told["admin"]) == ("toad", "lab1", False)
+    reported = ask(port, "GET", "/api/v1/session", headers={"Cookie": cookie, **origin}).json
+    assert (reported["user"], reported["realm"], reported["admin"]) == ("toad", "lab1", False)
 
 
-def test_oauth_knows_realms(labs: Labs) -> None:
-    """A token for the password of ``toad@lab1`` is one of that realm; elsewhere it is neither known nor revoked."""
-    port = labs.relay.http_port
+def test_oauth_knows_realms(world: World) -> None:
+    """A token for the password of ``toad@lab1`` belongs to that realm; elsewhere it is neither known nor
+    revoked.
+    """
+    port = world.relay.http_port
     form = {"Content-Type": "application/x-www-form-urlencoded"}
     granted = _form(port, "/oauth/token", f"grant_type=password&username=toad@lab1&password={PASSWORD}", form)
     assert granted.status == 200, granted.body
     token = granted.json["access_token"]
     for who, active in (("toad@lab1", True), ("root@lab2", False), ("toad@lab2", False)):
-        asking = {**form, "Authorization": f"Bearer {labs.tokens[who]}"}
+        asking = {**form, "Authorization": f"Bearer {world.tokens[who]}"}
         assert _form(port, "/oauth/introspect", f"token={token}", asking).json["active"] is active
-    stranger = {**form, "Authorization": f"Bearer {labs.tokens['root@lab2']}"}
+    stranger = {**form, "Authorization": f"Bearer {world.tokens['root@lab2']}"}
     assert _form(port, "/oauth/revoke", f"token={token}", stranger).status == 200
     assert ask(port, "GET", "/api/v1/robots", token=token).status == 200
-    own = {**form, "Authorization": f"Bearer {labs.tokens['toad@lab1']}"}
-    told = _form(port, "/oauth/introspect", f"token={token}", own).json
-    assert (told["sub"], told["realm"]) == ("toad@lab1", "lab1")
+    own = {**form, "Authorization": f"Bearer {world.tokens['toad@lab1']}"}
+    reported = _form(port, "/oauth/introspect", f"token={token}", own).json
+    assert (reported["sub"], reported["realm"]) == ("toad@lab1", "lab1")
 
 
 def _form(port: int, path: str, body: str, headers: dict[str, str]) -> Answer:
-    """A form, as OAuth has it."""
+    """An OAuth form."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
     try:
         connection.request("POST", path, body.replace(" ", "+"), headers)
@@ -131,7 +138,7 @@ def _form(port: int, path: str, body: str, headers: dict[str, str]) -> Answer:
         connection.close()
 
 
-# --- nothing crosses --------------------------------------------------------------------------------------
+# --- isolation --------------------------------------------------------------------------------------------
 
 SAID_TO_ALL = {
     ("get", "/robots/{robot}"),
@@ -139,6 +146,7 @@ SAID_TO_ALL = {
     ("get", "/robots/{robot}/video/stream_viewer"),
     ("get", "/api/v1/robots/{robot}/goals/{id}"),
     ("delete", "/api/v1/robots/{robot}/goals/{id}"),
+    ("post", "/api/v1/robots/{robot}/goals/{id}/cancel"),
 }
 """What is no question of the robot: what speaks at a websocket's address, a page that shows what is asked for, and
 one's own goals, of which there is none.
@@ -146,61 +154,61 @@ one's own goals, of which there is none.
 
 
 def of_a_robot() -> list[tuple[str, str]]:
-    """All that the HTTP interface does with a robot, by its own description."""
+    """All operations of the HTTP API on a robot, by its own description."""
     paths = document(operations(), "1", "session")["paths"]
     return [(method, path) for path in paths if "{robot}" in path for method in paths[path]]
 
 
 @pytest.mark.parametrize(("method", "path"), of_a_robot())
-def test_a_robot_of_another_realm_is_none(labs: Labs, method: str, path: str) -> None:
-    """Whatever is asked of it, the answer is that of a name nobody has, and not that of one's own robot."""
-    moment = labs.ask("root@lab1", "GET", "/api/v1/robots/mobile/services").headers["switchboard-moment"]
+def test_a_robot_of_another_realm_is_not_found(world: World, method: str, path: str) -> None:
+    """For each request the answer equals that for a missing name, not that of the own robot."""
+    moment = world.ask("root@lab1", "GET", "/api/v1/robots/mobile/services").headers["switchboard-freshness"]
 
     def answer(name: str) -> Answer:
         at = path.replace("{robot}", name).replace("{name}", "mode").replace("{id}", "0" * 32)
         query = "?topic=/camera" if path.startswith("/robots/") else ""
         end = path.partition("{robot}/")[2]
         body = None if method == "get" else ROBOT_BODIES.get(end, {})
-        return labs.ask("root@lab1", method.upper(), at + query, body, switchboard_moment=moment)
+        return world.ask("root@lab1", method.upper(), at + query, body, switchboard_freshness=moment)
 
     others, nobodys, own = (answer(name) for name in ("secret", "nobody", "mobile"))
     assert _without_names(others) == _without_names(nobodys)
     assert (_without_names(own)[:2] != _without_names(others)[:2]) is ((method, path) not in SAID_TO_ALL)
     if path.endswith("/stop"):
-        labs.relay.cli("resume", "mobile@lab1")
+        world.relay.cli("resume", "mobile@lab1")
 
 
 def _without_names(answer: Answer) -> tuple[Any, ...]:
-    """An answer but for what differs from one to the next: the name that was asked for, and the time."""
-    changing = {"date", "switchboard-moment", "ratelimit", "ratelimit-policy", "content-length"}
+    """An answer without its varying parts: the requested name, and the time."""
+    changing = {"date", "switchboard-freshness", "ratelimit", "ratelimit-policy", "content-length"}
     headers = sorted((name.lower(), value) for name, value in answer.headers.items())
     body = re.sub(rb"secret|nobody|mobile", b"*", answer.body)
     return answer.status, body, [each for each in headers if each[0] not in changing]
 
 
-def test_a_websocket_does_not_tell_that_it_is_there(labs: Labs) -> None:
-    """The same refusal as for a name nobody has."""
-    told = []
+def test_a_websocket_does_not_disclose_that_a_robot_exists(world: World) -> None:
+    """The refusal equals that for a missing name."""
+    reported = []
     for name in ("secret", "nobody"):
         with pytest.raises(InvalidStatus) as refused:
-            labs.relay.connect(name, labs.tokens["root@lab1"])
+            world.relay.connect(name, world.tokens["root@lab1"])
         body = refused.value.response.body or b""
-        told.append((refused.value.response.status_code, re.sub(rb"secret|nobody", b"*", body)))
-    assert told[0] == told[1]
+        reported.append((refused.value.response.status_code, re.sub(rb"secret|nobody", b"*", body)))
+    assert reported[0] == reported[1]
 
 
-def test_what_programs_register_stays_in_their_realm(labs: Labs) -> None:
-    """The directory of one realm shows nothing of the other's, and an entry's address is none there."""
+def test_registrations_stay_in_their_realm(world: World) -> None:
+    """The service registry of one realm shows no entries of the other, whose addresses are not found."""
     entry = {"kind": "service", "name": "speech", "address": "http://10.0.0.9/", "ttl": 600}
-    made = labs.ask("toad@lab2", "POST", "/api/v1/directory", entry)
+    made = world.ask("toad@lab2", "POST", "/api/v1/directory", entry)
     assert made.status == 201
-    assert _names(labs.ask("mole@lab2", "GET", "/api/v1/directory?kind=service")) == ["speech"]
-    assert _names(labs.ask("mole@lab2", "GET", "/api/v1/directory?realm=lab2&kind=service")) == ["speech"]
+    assert _names(world.ask("mole@lab2", "GET", "/api/v1/directory?kind=service")) == ["speech"]
+    assert _names(world.ask("mole@lab2", "GET", "/api/v1/directory?realm=lab2&kind=service")) == ["speech"]
     for query in ("?kind=service&name=spe*", "?realm=lab2", "?name=speech"):
-        assert _names(labs.ask("root@lab1", "GET", f"/api/v1/directory{query}")) == []
+        assert _names(world.ask("root@lab1", "GET", f"/api/v1/directory{query}")) == []
     place = made.headers["Location"]
     strange = re.sub(r"[^/]+$", lambda found: found[0][::-1], place)
-    there, nowhere = (labs.ask("root@lab1", "GET", each) for each in (place, strange))
+    there, nowhere = (world.ask("root@lab1", "GET", each) for each in (place, strange))
     assert (there.status, there.json["code"]) == (nowhere.status, nowhere.json["code"]) == (404, "not_found")
 
 
@@ -208,38 +216,38 @@ def _names(answer: Answer) -> list[str]:
     return [each["name"] for each in answer.json["entries"]]
 
 
-def test_events_are_remembered_in_their_realm(labs: Labs) -> None:
-    """Neither what there is, nor how many there are, nor their numbers say anything of the other realm."""
+def test_events_are_remembered_in_their_realm(world: World) -> None:
+    """Neither events, nor their count, nor their numbers disclose the other realm."""
     numbers = []
     for lab in LABS:
         event = {"kind": "coffee", "data": {"in": lab}}
-        numbers.append(labs.ask(f"toad@{lab}", "POST", "/api/v1/events", event).json)
+        numbers.append(world.ask(f"toad@{lab}", "POST", "/api/v1/events", event).json)
     assert [each["data"] for each in numbers] == [{"in": lab} for lab in LABS]
     for lab in LABS:
-        told = labs.ask(f"root@{lab}", "GET", "/api/v1/events?kind=coffee&limit=1000").json["events"]
-        assert [each["data"] for each in told] == [{"in": lab}]
-        count = labs.ask(f"root@{lab}", "GET", "/api/v1/events?kind=coffee&count=true").json["count"]
+        reported = world.ask(f"root@{lab}", "GET", "/api/v1/events?kind=coffee&limit=1000").json["events"]
+        assert [each["data"] for each in reported] == [{"in": lab}]
+        count = world.ask(f"root@{lab}", "GET", "/api/v1/events?kind=coffee&count=true").json["count"]
         assert count == 1
-    before = labs.ask("toad@lab1", "POST", "/api/v1/events", {"kind": "tick"}).json["id"]
+    before = world.ask("toad@lab1", "POST", "/api/v1/events", {"kind": "tick"}).json["id"]
     for _ in range(3):
-        labs.ask("toad@lab2", "POST", "/api/v1/events", {"kind": "tock"})
-    labs.ask("toad@lab1", "POST", "/api/v1/events", {"kind": "tick"})
-    own = labs.ask("root@lab1", "GET", "/api/v1/events?limit=1000").json["events"]
+        world.ask("toad@lab2", "POST", "/api/v1/events", {"kind": "tock"})
+    world.ask("toad@lab1", "POST", "/api/v1/events", {"kind": "tick"})
+    own = world.ask("root@lab1", "GET", "/api/v1/events?limit=1000").json["events"]
     since = sorted(each["id"] for each in own if each["id"] >= before)
     assert since == list(range(before, before + len(since)))
     assert "tock" not in {each["kind"] for each in own}
 
 
-def test_a_failed_login_is_told_where_it_was_tried(labs: Labs) -> None:
-    """Also for a user nobody has; and to no other realm, whether the named one exists or not."""
-    port = labs.relay.http_port
+def test_a_failed_login_is_logged_in_the_realm_where_it_was_tried(world: World) -> None:
+    """For unknown users too; no other realm gets the event, whether the named one exists or not."""
+    port = world.relay.http_port
     origin = {"Origin": f"http://127.0.0.1:{port}"}
     for user in ("toad@lab2", "ghost@lab2", "ghost@lab9"):
         body = {"user": user, "password": "wrong"}
         assert ask(port, "POST", "/api/v1/session", body, headers=origin).status == 401
 
     def tried(who: str) -> set[str]:
-        events = labs.ask(who, "GET", "/api/v1/events?kind=login.refused&limit=1000").json["events"]
+        events = world.ask(who, "GET", "/api/v1/events?kind=login.refused&limit=1000").json["events"]
         return {each["data"]["user"] for each in events if "ghost" in each["data"]["user"]}
 
     wait_for("it is remembered", lambda: tried("root@lab2"))
@@ -248,95 +256,95 @@ def test_a_failed_login_is_told_where_it_was_tried(labs: Labs) -> None:
 
 
 @pytest.mark.parametrize("order", [{"do": "stop"}, {"do": "call", "service": "/where"}])
-def test_an_order_to_all_robots_means_those_of_ones_own_realm(labs: Labs, order: dict[str, Any]) -> None:
-    """Though patterns and names of the other realm's are given: those are unmatched like any that nobody has."""
-    others = [robot for name, robot in labs.robots.items() if name.endswith("lab2")]
+def test_an_order_to_all_robots_means_those_of_the_callers_realm(world: World, order: dict[str, Any]) -> None:
+    """Patterns and names of the other realm count as unmatched."""
+    others = [robot for name, robot in world.robots.items() if name.endswith("lab2")]
     calls = [len(robot.calls) for robot in others]
     body = {"robots": ["*", "secret", "nobody"], **order}
-    answer = labs.ask("root@lab1", "POST", "/api/v1/fleet", body)
+    answer = world.ask("root@lab1", "POST", "/api/v1/fleet", body)
     head, *results = [json.loads(line) for line in answer.body.splitlines()]
     assert head["robots"] == ["mobile"]
     assert head["unmatched"] == ["secret", "nobody"]
     assert [(each["robot"], each["ok"]) for each in results if "robot" in each] == [("mobile", True)]
     assert [len(robot.calls) for robot in others] == calls
     assert [robot.stopped for robot in others] == [None, None]
-    labs.relay.cli("resume", "mobile@lab1")
+    world.relay.cli("resume", "mobile@lab1")
 
 
-def test_the_machines_administrator_reaches_all_realms_by_full_names(labs: Labs) -> None:
-    """``switchboard stop mobile@lab2`` stops that one, and ``status`` tells them from each other."""
-    told = labs.relay.cli("stop", "mobile@lab2")
-    assert told["robots"] == [{"robot": "mobile@lab2", "done": True}]
-    stopped = {name: robot.stopped is not None for name, robot in labs.robots.items()}
+def test_the_machines_administrator_reaches_all_realms_by_full_names(world: World) -> None:
+    """``switchboard stop mobile@lab2`` stops that one, and ``status`` shows full names."""
+    reported = world.relay.cli("stop", "mobile@lab2")
+    assert [(each["robot"], each["done"]) for each in reported["robots"]] == [("mobile@lab2", True)]
+    stopped = {name: robot.stopped is not None for name, robot in world.robots.items()}
     assert stopped == {"mobile@lab1": False, "mobile@lab2": True, "secret@lab2": False}
-    labs.relay.cli("resume", "mobile@lab2")
-    shown = {each["name"] for each in labs.relay.cli("status")["robots"]}
+    world.relay.cli("resume", "mobile@lab2")
+    shown = {each["name"] for each in world.relay.cli("status")["robots"]}
     assert shown >= {"mobile@lab1", "mobile@lab2", "secret@lab2"}
-    answer = labs.relay.cli("robot", "call", "mobile@lab2", "/where")
+    answer = world.relay.cli("robot", "call", "mobile@lab2", "/where")
     assert [(each["robot"], each["values"]["message"]) for each in answer["results"]] == [
         ("mobile@lab2",) * 2
     ]
-    assert labs.robots["mobile@lab2"].calls
+    assert world.robots["mobile@lab2"].calls
 
 
-def test_a_daemon_enrols_and_dials_with_its_realm(labs: Labs) -> None:
-    """``switchboard-robot`` takes the full name; its realm's administrator sees it by the short one."""
-    robot = Robot(labs.relay, "rover@lab2")
+def test_a_daemon_enrols_and_dials_with_its_realm(world: World) -> None:
+    """``switchboard-robot`` uses the full name; the realm's administrator sees the short one."""
+    robot = Robot(world.relay, "rover@lab2")
     try:
-        told = {
+        reported = {
             each["name"]: each["state"]
-            for each in labs.ask("root@lab2", "GET", "/api/v1/robots").json["robots"]
+            for each in world.ask("root@lab2", "GET", "/api/v1/robots").json["robots"]
         }
-        assert told["rover"] == "online"
-        of_others = labs.ask("root@lab1", "GET", "/api/v1/robots").json["robots"]
+        assert reported["rover"] == "online"
+        of_others = world.ask("root@lab1", "GET", "/api/v1/robots").json["robots"]
         assert [each["name"] for each in of_others] == ["mobile"]
     finally:
         robot.stop()
-        labs.relay.cli("robot", "remove", "rover@lab2", "--yes")
+        world.relay.cli("robot", "remove", "rover@lab2", "--yes")
 
 
-def test_rights_do_not_cross_realms(labs: Labs) -> None:
-    """A right of one realm's user on another's robot can't be given; the command says why."""
-    done = labs.relay.run_cli("right", "grant", "toad@lab1", "secret@lab2", "viewer")
+def test_rights_do_not_cross_realms(world: World) -> None:
+    """A right of one realm's user on another's robot is refused with a reason."""
+    done = world.relay.run_cli("right", "grant", "toad@lab1", "secret@lab2", "viewer")
     assert done.returncode != 0
-    assert "not of the realm of the holder" in done.stderr
+    assert "not belong to the realm of the holder" in done.stderr
 
 
-def test_the_record_tells_whose_it_was(labs: Labs) -> None:
-    """In the audit log users and robots have their full names."""
-    labs.relay.cli("stop", "mobile@lab1")
-    labs.relay.cli("resume", "mobile@lab1")
-    assert labs.ask("toad@lab1", "POST", "/api/v1/robots/mobile/stop", {"why": "a test"}).status == 200
-    labs.relay.cli("resume", "mobile@lab1")
+def test_the_audit_log_names_the_realm(world: World) -> None:
+    """Users and robots have their full names."""
+    world.relay.cli("stop", "mobile@lab1")
+    world.relay.cli("resume", "mobile@lab1")
+    assert world.ask("toad@lab1", "POST", "/api/v1/robots/mobile/stop", {"why": "a test"}).status == 200
+    world.relay.cli("resume", "mobile@lab1")
 
     def entries() -> list[dict[str, Any]]:
-        told = labs.relay.cli("audit", "list", "--limit", "1000")
-        return [each for each in told if each["actor"] == "user:toad@lab1"]
+        reported = world.relay.cli("audit", "list", "--limit", "1000")
+        return [each for each in reported if each["actor"] == "user:toad@lab1"]
 
     wait_for("it is on record", lambda: [each for each in entries() if each["action"] == "robot.stopped"])
     assert {each["target"] for each in entries() if each["action"] == "robot.stopped"} == {"mobile@lab1"}
 
 
-def test_numbers_of_the_whole_relay_are_for_its_own_administrators(labs: Labs) -> None:
-    """An administrator of another realm may not read them: they count everybody's."""
-    assert labs.ask("root@lab1", "GET", "/metrics").status == 403
-    labs.tokens["root"] = labs.relay.user("root", admin=True)
-    assert labs.ask("root", "GET", "/metrics").status == 200
-    assert labs.ask("root", "GET", "/api/v1/robots").json["robots"] == []
+def test_numbers_of_the_whole_relay_are_for_its_own_administrators(world: World) -> None:
+    """Administrators of other realms may not read them, since they count all realms."""
+    assert world.ask("root@lab1", "GET", "/metrics").status == 403
+    world.tokens["root"] = world.relay.user("root", admin=True)
+    assert world.ask("root", "GET", "/metrics").status == 200
+    assert world.ask("root", "GET", "/api/v1/robots").json["robots"] == []
 
 
-def test_a_realm_with_somebody_in_it_stays(labs: Labs) -> None:
-    """An empty one goes, with what its memory held; one with users or robots is refused with the reason."""
-    done = labs.relay.run_cli("realm", "remove", "lab1", "--yes")
+def test_a_realm_with_users_is_not_removed(world: World) -> None:
+    """An empty one is removed with its events; one with users or robots is refused with a reason."""
+    done = world.relay.run_cli("realm", "remove", "lab1", "--yes")
     assert done.returncode != 0
     assert "there are users and robots in the realm 'lab1'" in done.stderr
-    labs.relay.cli("realm", "add", "lab3")
-    token = labs.relay.user("ann@lab3")
-    assert ask(labs.relay.http_port, "POST", "/api/v1/events", {"kind": "x"}, token=token).status == 201
-    labs.relay.cli("user", "remove", "ann@lab3", "--yes")
-    labs.relay.cli("realm", "remove", "lab3", "--yes")
-    assert {each["realm"] for each in labs.relay.cli("realm", "list")} == {"default", "lab1", "lab2"}
+    world.relay.cli("realm", "add", "lab3")
+    token = world.relay.user("ann@lab3")
+    assert ask(world.relay.http_port, "POST", "/api/v1/events", {"kind": "x"}, token=token).status == 201
+    world.relay.cli("user", "remove", "ann@lab3", "--yes")
+    world.relay.cli("realm", "remove", "lab3", "--yes")
+    assert {each["realm"] for each in world.relay.cli("realm", "list")} == {"default", "lab1", "lab2"}
     wait_for(
         "her token ends with her",
-        lambda: ask(labs.relay.http_port, "GET", "/api/v1/events", token=token).status == 401,
+        lambda: ask(world.relay.http_port, "GET", "/api/v1/events", token=token).status == 401,
     )

@@ -1,4 +1,4 @@
-"""Recordings of the simulated robot, asked for over HTTP; the files as MCAP's own library and rosbags read them."""
+"""Recordings of the simulated robot over HTTP; the files are read by MCAP's own library and rosbags."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from mcap.stream_reader import StreamReader
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from switchboard_http import Answer, ask
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
 
 from relay_protocol.ros_types import TypeRegistry
+from tests.worlds.http_requests import Answer, ask
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.waiting import wait_for
 
 CAMERA = "/camera/image_raw"
 
 
 class Recorder:
-    """Somebody who asks for recordings."""
+    """A user who records."""
 
     def __init__(self, relay: Relay, robot: str, token: str) -> None:
         self._relay = relay
@@ -36,33 +36,33 @@ class Recorder:
         self._path = f"/api/v1/robots/{robot}/recordings"
 
     def ask(self, method: str, path: str = "", body: Any = None, **headers: str) -> Answer:
-        """One request."""
+        """Sends a request."""
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         return ask(self._relay.http_port, method, self._path + path, body, headers=given, token=self._token)
 
     def start(self, *topics: str, **more: Any) -> str:
-        """Begin one; its id."""
+        """Starts a recording; returns its id."""
         answer = self.ask("POST", "", {"topics": topics, **more})
         assert answer.status == 201, answer.body
         assert answer.headers["Location"] == f"{self._path}/{answer.json['id']}"
         return str(answer.json["id"])
 
     def look(self, id: str) -> dict[str, Any]:
-        """What is said of it."""
+        """Its description."""
         return dict(self.ask("GET", f"/{id}").json)
 
     def until(self, id: str, messages: int) -> None:
-        """Wait until so many are in the file."""
+        """Waits until the file has this many messages."""
         wait_for(f"{messages} messages", lambda: self.look(id)["messages"] >= messages)
 
     def stop(self, id: str) -> dict[str, Any]:
-        """End it."""
+        """Stops it."""
         answer = self.ask("POST", f"/{id}/stop")
         assert answer.status == 200, answer.body
         return dict(answer.json)
 
     def fetch(self, id: str, folder: Path) -> Path:
-        """Download it."""
+        """Downloads it."""
         answer = self.ask("GET", f"/{id}/file")
         assert answer.status == 200, answer.body
         assert f'filename="rover-{id}.mcap"' in answer.headers["Content-Disposition"]
@@ -72,7 +72,7 @@ class Recorder:
 
 
 def read(path: Path) -> list[tuple[Any, Any, Any]]:
-    """All messages with schema and channel, every checksum checked."""
+    """All messages with schema and channel; every checksum is verified."""
     with path.open("rb") as stream:
         list(StreamReader(stream, validate_crcs=True).records)
     with path.open("rb") as stream:
@@ -83,12 +83,12 @@ def read(path: Path) -> list[tuple[Any, Any, Any]]:
 
 @pytest.fixture
 def operator(world: Any) -> Recorder:
-    """Who may record."""
+    """A user who may record."""
     return Recorder(world.relay, "rover", world.operator)
 
 
-def test_what_is_recorded_is_what_a_subscriber_gets(world: Any, operator: Recorder, tmp_path: Path) -> None:
-    """As the robot serialised it, readable by the definitions in the file alone."""
+def test_recording_has_what_a_subscriber_receives(world: Any, operator: Recorder, tmp_path: Path) -> None:
+    """As the robot serialised it, readable with the definitions in the file."""
     id = operator.start("/odom", "tf")
     operator.until(id, 20)
     with world.relay.connect("rover", world.viewer) as client:
@@ -107,13 +107,13 @@ def test_what_is_recorded_is_what_a_subscriber_gets(world: Any, operator: Record
         types.add(schema.name, schema.data.decode())
         if channel.topic == "/odom":
             recorded.append(json.loads(types.to_json(schema.name, message.data)))
-    # What was heard while nothing was lost is there in one piece.
+    # The messages received without loss are in the file in one piece.
     first = recorded.index(heard[0])
     assert recorded[first : first + len(heard)] == heard
 
 
 def test_rosbags_reads_the_file(operator: Recorder, tmp_path: Path) -> None:
-    """As a rosbag2 file of MCAP, with no other knowledge of the types than the file's; what is latched says so."""
+    """As an MCAP rosbag2 file, with types from the file only; latched topics are marked."""
     id = operator.start("/odom", "/scan", "/tf_static")
     operator.until(id, 30)
     done = operator.stop(id)
@@ -150,7 +150,7 @@ def test_rosbags_reads_the_file(operator: Recorder, tmp_path: Path) -> None:
 
 
 def test_a_download_goes_on_where_it_broke_off(operator: Recorder, tmp_path: Path) -> None:
-    """As curl and browsers do it: the rest of the same file, if it still is the same."""
+    """As curl and browsers do it: the rest of the same file, if it is unchanged."""
     id = operator.start("/odom")
     operator.until(id, 20)
     operator.stop(id)
@@ -165,7 +165,7 @@ def test_a_download_goes_on_where_it_broke_off(operator: Recorder, tmp_path: Pat
     assert operator.ask("GET", f"/{id}/file", Range=f"bytes={len(whole)}-").status == 416
 
 
-def test_a_cameras_pictures_are_recorded(operator: Recorder, tmp_path: Path) -> None:
+def test_a_cameras_images_are_recorded(operator: Recorder, tmp_path: Path) -> None:
     """As CompressedImage, each a JPEG of the camera's size."""
     id = operator.start(cameras=[CAMERA])
     operator.until(id, 5)
@@ -183,17 +183,17 @@ def test_a_cameras_pictures_are_recorded(operator: Recorder, tmp_path: Path) -> 
 
 
 def test_it_ends_by_its_limits(operator: Recorder) -> None:
-    """Of time here, and says so."""
+    """By its time limit here; the result says so."""
     id = operator.start("/odom", seconds=5)
     done = wait_for("its end", lambda: (found := operator.look(id))["state"] == "complete" and found)
-    assert done["reason"] == "it has taken its time"
+    assert done["reason"] == "its time is over"
     assert done["messages"] > 5
     assert operator.ask("DELETE", f"/{id}").status == 204
     assert operator.ask("GET", f"/{id}").status == 404
 
 
-def test_who_may_not_record_gets_nothing(world: Any, operator: Recorder) -> None:
-    """Neither a recording nor what others recorded; who is nobody here is told no more than of any robot."""
+def test_recording_needs_the_right(world: Any, operator: Recorder) -> None:
+    """Neither recording nor downloading without it; an unauthenticated client gets the usual answer."""
     id = operator.start("/odom")
     viewer = Recorder(world.relay, "rover", world.viewer)
     assert viewer.ask("POST", "", {"topics": ["/odom"]}).status == 403
@@ -216,7 +216,7 @@ def test_who_may_not_record_gets_nothing(world: Any, operator: Recorder) -> None
 
 @pytest.fixture
 def own(tmp_path: Path) -> Iterator[tuple[Relay, Robot, str]]:
-    """A relay and a robot to be killed, and who may record."""
+    """A relay and a robot that the test may kill, and a user who may record."""
     relay = Relay(tmp_path)
     try:
         robot = Robot(relay, "rover")
@@ -231,8 +231,9 @@ def own(tmp_path: Path) -> Iterator[tuple[Relay, Robot, str]]:
 
 
 def test_a_recording_outlives_its_robot_and_its_relay(own: tuple[Relay, Robot, str], tmp_path: Path) -> None:
-    """A daemon that comes back goes on in the same file; what a killed relay wrote can be read after its next start;
-    a relay that is stopped finishes the file; a right that is revoked ends the recording."""
+    """A restarted daemon continues in the same file; a killed relay's file is readable after its next start;
+    a stopped relay finishes the file; a revoked right ends the recording.
+    """
     relay, robot, token = own
     recorder = Recorder(relay, "rover", token)
     wait_for("the graph", lambda: recorder.ask("POST", "", {"topics": ["/odom"], "seconds": 1}).status == 201)
@@ -246,7 +247,7 @@ def test_a_recording_outlives_its_robot_and_its_relay(own: tuple[Relay, Robot, s
     relay.kill()
     relay.start()
     wait_for("it is recovered", lambda: recorder.look(id)["state"] == "recovered")
-    # What was in memory for about a second is lost, of what comes 20 to 50 times a second.
+    # About a second in memory is lost, of 20 to 50 messages per second.
     assert len(read(recorder.fetch(id, tmp_path))) >= before + 20
     robot.wait_online()
     id = recorder.start("/odom")
@@ -266,7 +267,7 @@ def test_a_recording_outlives_its_robot_and_its_relay(own: tuple[Relay, Robot, s
 
 
 def test_recordings_go_with_their_robot(own: tuple[Relay, Robot, str]) -> None:
-    """The one that runs is stopped; what is removed while no relay runs goes when the next starts."""
+    """A running one is stopped; one of a robot removed without a relay is deleted at the next start."""
     relay, robot, token = own
     recorder = Recorder(relay, "rover", token)
     wait_for("the graph", lambda: recorder.ask("POST", "", {"topics": ["/odom"], "seconds": 1}).status == 201)

@@ -1,4 +1,4 @@
-"""A robot's resources in the forms of RDF, with a real relay, a real ROS 2 robot and httpx."""
+"""A robot's resources in RDF formats, with a real relay, a real ROS 2 robot and httpx."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 import httpx
 import pytest
 from rdflib import RDF, RDFS, SOSA, XSD, Graph, Literal, URIRef
-from switchboard_waiting import wait_for
 
 from relay_server.common.freshness_tokens import HEADER
 from relay_server.http.media_types import FORMS
 from relay_server.http.rdf.decode import message_in
+from tests.worlds.waiting import wait_for
 
 ROBOT = "/api/v1/robots/rover"
 RDF_MEDIA = [each.media for each in FORMS if each.mark]
@@ -39,7 +39,7 @@ PREFIXES = """@prefix own: <{base}/api/v1/vocabulary/switchboard#> .
 
 @pytest.fixture
 def client(world: Any) -> Iterator[httpx.Client]:
-    """Requests of who may drive."""
+    """Requests of an operator."""
     with world.over_http() as client:
         yield client
 
@@ -50,7 +50,7 @@ def base_of(client: httpx.Client) -> str:
 
 
 def get(client: httpx.Client, address: str, media: str, **more: Any) -> httpx.Response:
-    """An answer in a form."""
+    """An answer in a format."""
     return client.get(address, headers={"Accept": media, **more})
 
 
@@ -62,18 +62,18 @@ def graph_of(answer: httpx.Response) -> Graph:
 
 
 def test_a_state_is_the_same_in_all_forms(world: Any, client: httpx.Client) -> None:
-    """Read by nothing but rdflib; each with a tag of its own, by which it is known in that form alone."""
+    """Read by rdflib only; each format has its own entity tag."""
     topic = {"topic": "/forms/measured", "type": "nav_msgs/msg/Odometry"}
     address = f"topics{topic['topic']}"
     with world.relay.connect("rover", world.operator) as other:
         odometry = client.get("topics/odom", params={"wait": 60}).json()["value"]
         other.send(op="advertise", **topic)
 
-        def heard() -> bool:
+        def received() -> bool:
             other.send(op="publish", topic=topic["topic"], msg=odometry)
             return client.get(address, params={"wait": 1}).status_code == 200
 
-        wait_for("it is heard", heard)
+        wait_for("it is heard", received)
         plain = client.get(address)
         tags = {plain.headers["etag"]}
         for media in RDF_MEDIA:
@@ -94,7 +94,7 @@ def test_a_state_is_the_same_in_all_forms(world: Any, client: httpx.Client) -> N
 
 @pytest.mark.parametrize("media", RDF_MEDIA)
 def test_odometry_is_an_observation(client: httpx.Client, media: str) -> None:
-    """With its sensor, its time, and numbers typed as ROS has them."""
+    """With its sensor, its time, and numbers with their ROS types."""
     graph = graph_of(get(client, "topics/odom?wait=60", media))
     topic, words = URIRef(f"{base_of(client)}{ROBOT}/topics/odom"), f"{base_of(client)}/api/v1/vocabulary/"
     assert (topic, RDF.type, SOSA.Observation) in graph
@@ -106,7 +106,7 @@ def test_odometry_is_an_observation(client: httpx.Client, media: str) -> None:
 
 
 def test_a_twist_in_xml_moves_the_robot(world: Any, client: httpx.Client) -> None:
-    """Under the same rules as in JSON: it says when it was sent."""
+    """Under the same rules as JSON: it needs a freshness token."""
 
     def put(speed: float, **headers: str) -> httpx.Response:
         body = TWIST.format(base=base_of(client), speed=speed)
@@ -116,7 +116,7 @@ def test_a_twist_in_xml_moves_the_robot(world: Any, client: httpx.Client) -> Non
 
     world.left_alone()
     needed = put(0.2)
-    assert (needed.status_code, needed.json()["code"]) == (428, "moment_needed")
+    assert (needed.status_code, needed.json()["code"]) == (428, "freshness_required")
     moment = needed.headers[HEADER]
 
     def drives() -> bool:
@@ -131,8 +131,8 @@ def test_a_twist_in_xml_moves_the_robot(world: Any, client: httpx.Client) -> Non
     wait_for("it stands", lambda: not world.robot.moving())
 
 
-def test_a_message_in_turtle_reaches_who_listens(world: Any, client: httpx.Client) -> None:
-    """Its type is in the words it uses, and what it says is checked by it."""
+def test_a_message_in_turtle_reaches_subscribers(world: Any, client: httpx.Client) -> None:
+    """Its type follows from its terms, and its content is checked."""
     topic = {"topic": "/forms/said", "type": "std_msgs/msg/String"}
     headers = {"Content-Type": "text/turtle"}
     prefixes = PREFIXES.format(base=base_of(client))
@@ -149,10 +149,10 @@ def test_a_message_in_turtle_reaches_who_listens(world: Any, client: httpx.Clien
 
 
 def test_a_parameter_is_set_in_turtle(client: httpx.Client) -> None:
-    """As it was read, in whichever form that was."""
+    """As it was read, in any format."""
 
     def found() -> str:
-        """A node that does not answer in time is left out."""
+        """A node without a timely answer is left out."""
         listed = client.get("params", params={"limit": 1000}).json()["params"]
         return next((each["name"] for each in listed if each["name"].endswith(":use_sim_time")), "")
 
@@ -176,23 +176,23 @@ def test_a_parameter_is_set_in_turtle(client: httpx.Client) -> None:
 
 
 def test_a_page_lists_addresses(client: httpx.Client) -> None:
-    """Which can be read in turn."""
+    """Each of them can be read."""
     answer = get(client, "topics?name=/odom", "text/turtle")
     (odom,) = graph_of(answer).objects(None, RDFS.member)
     assert graph_of(get(client, f"{odom}?wait=60", "text/turtle"))
-    # Reading a topic makes one more subscriber: that page may be another by now.
+    # Reading a topic adds a subscriber, so that page may differ by now.
     services = get(client, "services", "text/turtle")
     known = {"If-None-Match": services.headers["etag"]}
     assert get(client, "services", "text/turtle", **known).status_code == 304
     assert len(graph_of(get(client, "services", "application/ld+json"))) > 10
     (stop,) = graph_of(get(client, "services?name=/relay/stop", "text/turtle")).objects(None, RDFS.member)
     for media in RDF_MEDIA:
-        told = graph_of(get(client, str(stop), media))
-        assert set(told.subjects()) == {stop} and len(told) > 3
+        reported = graph_of(get(client, str(stop), media))
+        assert set(reported.subjects()) == {stop} and len(reported) > 3
 
 
 def test_a_robot_is_a_platform_with_its_collections(world: Any, client: httpx.Client) -> None:
-    """The one that the graphs of its topics name; each collection has the address at which it is listed."""
+    """It is the one in the graphs of its topics; each collection has the address of its list."""
     robot, here = URIRef(f"{base_of(client)}{ROBOT}"), f"{base_of(client)}/api/v1/vocabulary/switchboard#"
     world.robot.wait_online()
     topic = graph_of(get(client, "topics/odom?wait=60", "text/turtle"))
@@ -212,7 +212,7 @@ def test_a_robot_is_a_platform_with_its_collections(world: Any, client: httpx.Cl
         assert graph.value(robot, URIRef(f"{here}name")) == Literal("rover", datatype=XSD.string)
         assert graph.value(robot, URIRef(f"{here}platform")) == Literal("ros2", datatype=XSD.string)
         collections = {str(each) for each in graph.objects(robot, URIRef(f"{here}collections"))}
-        parts = ("topics", "services", "actions", "params", "cameras", "modules")
+        parts = ("topics", "services", "actions", "params", "cameras", "nodes")
         assert collections == {f"{robot}/{each}" for each in parts}
     assert len(tags) == 1 + len(RDF_MEDIA)
     for each in sorted(collections - {f"{robot}/params"}):
@@ -222,8 +222,8 @@ def test_a_robot_is_a_platform_with_its_collections(world: Any, client: httpx.Cl
     assert get(client, str(robot), "text/turtle", **hidden).status_code == 404
 
 
-def test_what_is_not_there_is_told_with_what_is(client: httpx.Client) -> None:
-    """Forms that are not made, forms that are not read, and bodies that can't be."""
+def test_missing_name_is_reported_with_existing_ones(client: httpx.Client) -> None:
+    """Unsupported formats of answers and of bodies, and invalid bodies."""
     unknown = get(client, "topics/odom", "text/html")
     assert unknown.status_code == 406 and unknown.headers["vary"] == "Accept"
     assert unknown.headers["content-type"] == "application/problem+json"
@@ -236,11 +236,11 @@ def test_what_is_not_there_is_told_with_what_is(client: httpx.Client) -> None:
         assert broken.status_code == 400 and broken.json()["detail"]
     remote = b'{"@context": "http://127.0.0.1:9/", "@id": ""}'
     fetched = client.put("topics/cmd_vel", content=remote, headers={"Content-Type": "application/ld+json"})
-    assert fetched.status_code == 400 and "no context is fetched" in fetched.json()["detail"]
+    assert fetched.status_code == 400 and "contexts are not fetched" in fetched.json()["detail"]
 
 
 def test_every_word_has_a_meaning_at_its_address(client: httpx.Client) -> None:
-    """The relay's own, types and their fields: what is read of a robot can be looked up, word by word."""
+    """The relay's own terms, types and their fields can all be looked up."""
     read = (f"{base_of(client)}{ROBOT}", "topics/odom?wait=60", "topics", "cameras")
     graphs = [graph_of(get(client, each, "text/turtle")) for each in read]
     here = f"{base_of(client)}/api/v1/vocabulary/"
@@ -255,15 +255,15 @@ def test_every_word_has_a_meaning_at_its_address(client: httpx.Client) -> None:
     for document in {each.partition("#")[0] for each in words}:
         for media in (*RDF_MEDIA, "text/html"):
             assert get(client, document, media).status_code == 200, document
-        told = graph_of(get(client, document, "text/turtle"))
-        # What names of fields mean that have no type is told of all of them at once.
+        reported = graph_of(get(client, document, "text/turtle"))
+        # Field names without a type are defined together.
         for each in set() if document.endswith("/fields") else words:
             if each.partition("#")[0] == document:
-                assert told.value(URIRef(each), RDFS.comment) is not None, each
+                assert reported.value(URIRef(each), RDFS.comment) is not None, each
 
 
 def test_cameras_are_resources(world: Any, client: httpx.Client) -> None:
-    """Those that may be viewed, with the addresses of their pictures."""
+    """Visible ones, with the addresses of their pictures."""
     name = "/camera/image_raw"
 
     def page() -> Any:
@@ -271,10 +271,10 @@ def test_cameras_are_resources(world: Any, client: httpx.Client) -> None:
 
     wait_for("the robot has told its cameras", lambda: page()["cameras"])
     assert [each["name"] for each in page()["cameras"]] == [name] and page()["next"] == ""
-    told = client.get(f"cameras{name}").json()
-    assert told["type"] == "sensor_msgs/msg/Image"
-    snapshot = f"{base_of(client)}{told['addresses']['snapshot']}"
-    # On a busy machine what shows the camera takes its time to begin.
+    reported = client.get(f"cameras{name}").json()
+    assert reported["type"] == "sensor_msgs/msg/Image"
+    snapshot = f"{base_of(client)}{reported['addresses']['snapshot']}"
+    # On a busy machine the camera's publisher starts slowly.
     wait_for("a picture", lambda: client.get(snapshot).status_code == 200)
     assert client.get(snapshot).headers["content-type"] == "image/jpeg"
     width = client.get(f"cameras{name}").json()["width"]

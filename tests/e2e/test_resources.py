@@ -10,12 +10,12 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_drive import LET_GO_SECONDS
-from switchboard_processes import ros_environment
-from switchboard_waiting import wait_for
 
 from relay_server.common.freshness_tokens import HEADER
 from tests.robot_client.ros import Peer
+from tests.worlds.driving import LET_GO_SECONDS
+from tests.worlds.processes import ros_environment
+from tests.worlds.waiting import wait_for
 
 ROBOT = "/api/v1/robots/rover"
 GO = {"value": {"linear": {"x": 0.2}, "angular": {"z": 0.3}}}
@@ -32,20 +32,20 @@ def client_of(world: Any, token: str) -> httpx.Client:
 
 @pytest.fixture
 def operator(world: Any) -> Iterator[httpx.Client]:
-    """Requests of who may drive."""
+    """Requests of an operator."""
     with client_of(world, world.operator) as client:
         yield client
 
 
 @pytest.fixture
 def viewer(world: Any) -> Iterator[httpx.Client]:
-    """Requests of who may look."""
+    """Requests of a viewer."""
     with client_of(world, world.viewer) as client:
         yield client
 
 
-def test_what_there_is_is_told_page_by_page(viewer: httpx.Client) -> None:
-    """By names and types, with what moves the robot."""
+def test_collections_are_paged(viewer: httpx.Client) -> None:
+    """By names and types; motion topics are marked."""
     first = viewer.get("topics", params={"limit": 2}).json()
     assert len(first["topics"]) == 2 and first["next"] == first["topics"][-1]["name"] and first["online"]
     second = viewer.get("topics", params={"limit": 1000, "after": first["next"]}).json()
@@ -61,7 +61,7 @@ def test_what_there_is_is_told_page_by_page(viewer: httpx.Client) -> None:
 
 
 def test_a_topic_is_read_again_only_when_it_has_changed(viewer: httpx.Client) -> None:
-    """Its newest message, with an entity tag; who knows it waits for the next."""
+    """Its newest message, with an entity tag; a request with the tag waits for the next."""
     answer = viewer.get("topics/odom", params={"wait": 60})
     state = answer.json()
     assert (state["topic"], state["type"]) == ("/odom", "nav_msgs/msg/Odometry")
@@ -70,27 +70,28 @@ def test_a_topic_is_read_again_only_when_it_has_changed(viewer: httpx.Client) ->
     known = {"If-None-Match": tag}
     following = viewer.get("topics/odom", headers=known, params={"wait": 60})
     assert following.status_code == 200 and following.headers["etag"] != tag
-    # The time of the same message may be told otherwise another time.
+    # The time of the same message may have another form.
     assert tag.startswith('W/"')
 
 
 def test_a_topic_is_streamed(viewer: httpx.Client) -> None:
-    """As server-sent events, no more often than was asked for."""
-    heard: list[Any] = []
+    """As server-sent events, at most at the requested rate."""
+    received: list[Any] = []
     headers = {"Accept": "text/event-stream"}
     with viewer.stream("GET", "topics/odom", headers=headers, params={"throttle_ms": 200}) as answer:
         assert answer.headers["content-type"] == "text/event-stream"
         for line in answer.iter_lines():
-            if line.startswith("data: "):
-                heard.append(json.loads(line.removeprefix("data: ")))
-            if len(heard) >= 8:
+            # On a busy machine there may be statuses between the messages.
+            if line.startswith('data: {"header"'):
+                received.append(json.loads(line.removeprefix("data: ")))
+            if len(received) >= 8:
                 break
-    stamps = [each["header"]["stamp"]["sec"] + each["header"]["stamp"]["nanosec"] / 1e9 for each in heard]
+    stamps = [each["header"]["stamp"]["sec"] + each["header"]["stamp"]["nanosec"] / 1e9 for each in received]
     assert stamps == sorted(stamps) and stamps[-1] - stamps[0] > 0.7, "half of what they are apart at least"
 
 
 def stands_by_order(client: httpx.Client) -> None:
-    """Say zero, until it comes in time."""
+    """Sends zero until it arrives in time."""
 
     def said() -> bool:
         moment = client.get("topics").headers[HEADER]
@@ -101,11 +102,11 @@ def stands_by_order(client: httpx.Client) -> None:
     wait_for("a zero comes in time", said)
 
 
-def test_who_gives_back_a_moment_drives(world: Any, operator: httpx.Client) -> None:
-    """Without one, or with one that is too old, nothing moves; control comes by the first command, and ends."""
+def test_request_with_a_freshness_token_drives(world: Any, operator: httpx.Client) -> None:
+    """Without one, or with an old one, nothing moves; the first command takes control, which ends by itself."""
     world.left_alone()
     needed = operator.put("topics/cmd_vel", json=GO)
-    assert (needed.status_code, needed.json()["code"]) == (428, "moment_needed")
+    assert (needed.status_code, needed.json()["code"]) == (428, "freshness_required")
     moment = needed.headers[HEADER]
 
     def drives() -> bool:
@@ -119,7 +120,7 @@ def test_who_gives_back_a_moment_drives(world: Any, operator: httpx.Client) -> N
     assert operator.get("control").json()["holder"]["user"] == "operator"
     stands_by_order(operator)
     wait_for("it stands", lambda: not world.robot.moving())
-    time.sleep(0.6)  # so the first moment is older than any command may be
+    time.sleep(0.6)  # so the first token is older than any command may be
     late = operator.put("topics/cmd_vel", json=GO, headers={HEADER: needed.headers[HEADER]})
     assert (late.status_code, late.json()["code"]) == (412, "too_old")
     operator.post("control/release")
@@ -129,7 +130,7 @@ def test_who_gives_back_a_moment_drives(world: Any, operator: httpx.Client) -> N
 
 
 def test_another_type_does_not_make_a_command_young(world: Any, operator: httpx.Client) -> None:
-    """What moves the robot is known by the topic, whatever type is named."""
+    """Motion is recognised by the topic, for any named type."""
     world.left_alone()
     stands_by_order(operator)
     for kind in ("std_msgs/msg/String", "geometry_msgs/Twist", ""):
@@ -139,8 +140,8 @@ def test_another_type_does_not_make_a_command_young(world: Any, operator: httpx.
     operator.post("control/release")
 
 
-def test_who_went_on_commanding_in_vain_lets_go_first(world: Any, operator: httpx.Client) -> None:
-    """As by rosbridge: whoever takes control with his hand on the stick moves nothing by that."""
+def test_refused_commands_require_a_release(world: Any, operator: httpx.Client) -> None:
+    """As by rosbridge: a client that takes control while it commands moves nothing."""
     token = world.relay.user("driver")
     world.relay.cli("right", "grant", "driver", "rover", "operator")
     moment = operator.get("topics").headers[HEADER]
@@ -154,7 +155,7 @@ def test_who_went_on_commanding_in_vain_lets_go_first(world: Any, operator: http
     with world.relay.connect("rover", token) as other:
 
         def insists() -> httpx.Response | None:
-            """What he hears, unless the machine was so slow that he has let go."""
+            """The client's error, or None if the machine was so slow that it counts as a release."""
             nonlocal moment
             assert other.call("/relay/take_control")["values"]["success"]
             moment = operator.get("topics").headers[HEADER]
@@ -170,16 +171,16 @@ def test_who_went_on_commanding_in_vain_lets_go_first(world: Any, operator: http
             return None
 
         refused = wait_for("he went on without a pause", insists)
-    assert refused.status_code == 403 and "let go" in refused.json()["detail"]
-    time.sleep(LET_GO_SECONDS)  # so long he must say nothing
+    assert refused.status_code == 403 and "release the controls" in refused.json()["detail"]
+    time.sleep(LET_GO_SECONDS)  # a pause this long counts as a release
     moment = operator.get("topics").headers[HEADER]
     wait_for("it moves", lambda: commands().status_code == 204 and world.robot.moving())
     operator.post("control/release")
     wait_for("it stands", lambda: not world.robot.moving())
 
 
-def test_what_the_relay_says_itself_is_there_at_once(viewer: httpx.Client) -> None:
-    """Also what it tells only when it changes; read and streamed."""
+def test_topics_of_the_relay_are_there_at_once(viewer: httpx.Client) -> None:
+    """This includes topics that are published only on changes; they can be read and streamed."""
     state = viewer.get("topics/relay/control", params={"wait": 0.5})
     assert state.status_code == 200 and state.json()["value"]["robot"] == "rover"
     with viewer.stream("GET", "topics/relay/control", headers={"Accept": "text/event-stream"}) as answer:
@@ -188,7 +189,7 @@ def test_what_the_relay_says_itself_is_there_at_once(viewer: httpx.Client) -> No
 
 
 def test_a_right_that_is_withdrawn_ends_what_is_read(world: Any) -> None:
-    """What was heard before is shown no more; a stream ends with the reason; and all is back with the right."""
+    """Earlier messages are not shown either; a stream ends with the reason; a new right restores all."""
     token = world.relay.user("reader")
     world.relay.cli("right", "grant", "reader", "rover", "operator")
     with client_of(world, token) as reader:
@@ -211,8 +212,8 @@ def test_a_right_that_is_withdrawn_ends_what_is_read(world: Any) -> None:
         wait_for("it is new", lambda: stamp() != first)
 
 
-def test_who_may_only_look_changes_nothing(world: Any, viewer: httpx.Client) -> None:
-    """In the same words as by rosbridge."""
+def test_viewer_cannot_change_anything(world: Any, viewer: httpx.Client) -> None:
+    """The answers equal those of rosbridge."""
     world.left_alone()
     moment = viewer.get("topics").headers[HEADER]
     for way in (
@@ -224,8 +225,8 @@ def test_who_may_only_look_changes_nothing(world: Any, viewer: httpx.Client) -> 
     assert not world.robot.moving()
 
 
-def test_a_message_reaches_who_listens(world: Any, operator: httpx.Client) -> None:
-    """Checked against its type before it goes out."""
+def test_a_message_reaches_subscribers(world: Any, operator: httpx.Client) -> None:
+    """It is checked against its type first."""
     topic = {"topic": "/resources/said", "type": "std_msgs/msg/String"}
     with world.relay.connect("rover", world.operator) as client:
         client.send(op="advertise", **topic)
@@ -238,15 +239,15 @@ def test_a_message_reaches_who_listens(world: Any, operator: httpx.Client) -> No
 
 
 def test_a_service_is_called(operator: httpx.Client) -> None:
-    """Its answer, or in words why there is none."""
+    """Its answer, or the reason of a failure."""
     answer = operator.post("services/reset", json={})
     assert answer.status_code == 200 and answer.json()["values"]["success"] is True
     missing = operator.post("services/nowhere", json={"timeout": 1})
     assert missing.status_code == 404 and "/nowhere" in missing.json()["detail"]
 
 
-def test_one_service_is_told_as_it_is_listed(world: Any, viewer: httpx.Client) -> None:
-    """To who may use it, and with a tag by which it is known; to others it is not there."""
+def test_service_is_described_as_listed(world: Any, viewer: httpx.Client) -> None:
+    """With an entity tag, for users with the right; for others it is not found."""
     (listed,) = viewer.get("services", params={"name": "/relay/stop"}).json()["services"]
     answer = viewer.get("services/relay/stop")
     assert (answer.status_code, answer.json()) == (200, listed)
@@ -259,16 +260,16 @@ def test_one_service_is_told_as_it_is_listed(world: Any, viewer: httpx.Client) -
     assert hidden.json()["detail"].replace("/reset", "/nowhere") == missing.json()["detail"]
 
 
-def test_what_a_module_has_is_where_its_names_lead(viewer: httpx.Client) -> None:
+def test_names_of_a_node_are_links(viewer: httpx.Client) -> None:
     """Each service of the relay's own node."""
-    services = viewer.get("modules/relay").json()["services"]
+    services = viewer.get("nodes/relay").json()["services"]
     assert "/relay/stop" in services
     for name in services:
         assert viewer.get(f"services{name}").json()["name"] == name
 
 
 def test_a_method_that_an_address_does_not_take(world: Any, viewer: httpx.Client) -> None:
-    """Is told with those it takes, to who may know of what is there."""
+    """The answer lists the allowed ones, for users who may know the resource."""
     for method, address, takes in (
         ("PUT", "services/relay/stop", "GET, HEAD, POST"),
         ("DELETE", "topics/odom", "GET, HEAD, POST, PUT"),
@@ -284,8 +285,8 @@ def test_a_method_that_an_address_does_not_take(world: Any, viewer: httpx.Client
     assert viewer.put("services/reset").status_code == viewer.delete("topics/nowhere").status_code == 404
 
 
-def test_what_is_said_on_a_topic_is_compared_with_nothing(operator: httpx.Client) -> None:
-    """It takes the place of no other message."""
+def test_message_text_is_not_compared(operator: httpx.Client) -> None:
+    """A published message replaces no other."""
     said = {"value": {"data": "x"}, "type": "std_msgs/msg/String"}
     for method in ("PUT", "POST"):
         answer = operator.request(method, "topics/resources/said", json=said, headers={"If-Match": "*"})
@@ -293,18 +294,18 @@ def test_what_is_said_on_a_topic_is_compared_with_nothing(operator: httpx.Client
 
 
 def test_a_message_may_be_too_old(operator: httpx.Client, viewer: httpx.Client) -> None:
-    """Of a topic on which nobody speaks any more, who wants it younger than it is gets none."""
+    """On a silent topic, a request for a newer message gets none."""
     address, now = "topics/resources/quiet", {"wait": 0}
     said = {"value": {"data": "once"}, "type": "std_msgs/msg/String"}
     assert operator.post(address, json=said).status_code == 204
 
-    def heard() -> bool:
+    def received() -> bool:
         assert operator.post(address, json=said).status_code == 204
         return viewer.get(address, params={"wait": 1, "max_age": 60}).status_code == 200
 
     def grown_old() -> httpx.Response | None:
-        """The message, which was too old; none where the machine was so slow that its reader was forgotten."""
-        wait_for("it is heard", heard)
+        """The message that was too old; None if the machine was so slow that the reader was dropped."""
+        wait_for("it is heard", received)
         young = {**now, "max_age": 0.2}
         wait_for("it is too old", lambda: viewer.get(address, params=young).status_code == 504)
         return _found(viewer.get(address, params=now))
@@ -326,8 +327,8 @@ def peer(world: Any) -> Iterator[Peer]:
     peer.close()
 
 
-def test_of_two_who_have_read_the_same_one_changes_it(operator: httpx.Client, peer: Peer) -> None:
-    """However close together they come: the other is told that it is another by now."""
+def test_of_two_changes_to_the_same_state_one_succeeds(operator: httpx.Client, peer: Peer) -> None:
+    """For any timing: the other one gets a conflict."""
     address = "params/robot/peer:loose"
     read = wait_for("the node tells it", lambda: _found(operator.get(address)))
     for number in range(10):
@@ -349,7 +350,7 @@ def test_of_two_who_have_read_the_same_one_changes_it(operator: httpx.Client, pe
 
 
 def test_a_parameter_is_deleted(operator: httpx.Client, peer: Peer) -> None:
-    """As it was read, or not at all; then it is not there, and the node's others are."""
+    """With its entity tag or not at all; other parameters of the node stay."""
     address = "params/robot/peer:loose"
     read = wait_for("the node tells it", lambda: _found(operator.get(address)))
     assert read.json()["value"] == "here"
@@ -365,10 +366,10 @@ def test_a_parameter_is_deleted(operator: httpx.Client, peer: Peer) -> None:
 
 
 def test_a_parameter_is_read_and_written_as_it_was_read(operator: httpx.Client) -> None:
-    """Who has read another value than there is now changes nothing."""
+    """A request with the tag of another value changes nothing."""
 
     def found() -> str:
-        """A node that does not answer in time is left out."""
+        """A node without a timely answer is left out."""
         listed = operator.get("params", params={"limit": 1000}).json()["params"]
         return next((each["name"] for each in listed if each["name"].endswith(":use_sim_time")), "")
 
@@ -398,7 +399,7 @@ def test_a_parameter_is_read_and_written_as_it_was_read(operator: httpx.Client) 
         ("services/no name", 400),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_words(viewer: httpx.Client, address: str, status: int) -> None:
+def test_invalid_value_is_refused_with_a_reason(viewer: httpx.Client, address: str, status: int) -> None:
     """As problem details."""
     answer = viewer.get(address)
     assert answer.status_code == status
@@ -406,6 +407,6 @@ def test_what_makes_no_sense_is_refused_in_words(viewer: httpx.Client, address: 
 
 
 def test_the_relay_has_logged_no_failure_of_its_own(world: Any, viewer: httpx.Client) -> None:
-    """Neither of streams that ended nor of readers who left."""
+    """Neither ended streams nor readers that left caused one."""
     assert viewer.get("topics").status_code == 200
     assert "Traceback" not in world.relay.log

@@ -1,12 +1,13 @@
-"""No right, no channel; a viewer only watches; a right that is revoked ends what is open."""
+"""Without a right there is no channel; a viewer only reads; a revoked right ends open connections."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
-from switchboard_waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from tests.worlds.waiting import wait_for
 
 
 def refusal(world: Any, robot: str, token: str) -> InvalidStatus:
@@ -15,32 +16,31 @@ def refusal(world: Any, robot: str, token: str) -> InvalidStatus:
     return caught.value
 
 
-def test_a_stranger_gets_no_channel(world: Any) -> None:
+def test_a_user_without_a_right_gets_no_channel(world: Any) -> None:
     """A user without a right on the robot is refused in the handshake."""
     assert refusal(world, "rover", world.stranger).response.status_code == 403
 
 
 def test_a_robot_that_does_not_exist_answers_like_one_without_rights(world: Any) -> None:
-    """Nobody can find out by asking which robots there are."""
+    """The answer does not disclose which robots exist."""
     missing = refusal(world, "no-such-robot", world.stranger).response
     foreign = refusal(world, "rover", world.stranger).response
     assert (missing.status_code, missing.reason_phrase) == (foreign.status_code, foreign.reason_phrase)
 
 
 def test_a_wrong_token_is_refused(world: Any) -> None:
-    """An access token nobody issued opens nothing."""
+    """An unknown access token is refused."""
     assert refusal(world, "rover", "swb_wrong").response.status_code == 401
 
 
 def test_a_viewer_sees_samples(world: Any) -> None:
-    """Watching is what a viewer may."""
     with world.relay.connect("rover", world.viewer) as client:
         client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
         assert client.until(op="publish", topic="/odom")["msg"]["header"]["frame_id"] == "odom"
 
 
 def test_a_viewers_command_is_refused_with_the_reason_and_never_reaches_the_robot(world: Any) -> None:
-    """A viewer's publish is answered by a status that says why, and the robot gets nothing."""
+    """The publish gets a status with a reason, and the robot receives nothing."""
     since = world.left_alone()
     with world.relay.connect("rover", world.viewer) as client:
         client.send(op="set_level", level="error")
@@ -48,21 +48,21 @@ def test_a_viewers_command_is_refused_with_the_reason_and_never_reaches_the_robo
         status = client.until(op="status")
         assert status["level"] == "error"
         assert "needs the level operator" in status["msg"]
-        # Whatever went to the robot before this answer has arrived there.
+        # Earlier messages to the robot have arrived by the time of this answer.
         assert client.call("/relay/ping", {"robot": True})["result"]
     assert world.robot.events("command", since) == []
 
 
 def test_a_viewers_call_is_refused_with_the_reason(world: Any) -> None:
-    """A viewer's service call is answered with result false and words."""
+    """It is answered with result false and a reason."""
     with world.relay.connect("rover", world.viewer) as client:
         answer = client.call("/reset")
     assert answer["result"] is False
     assert "needs the level operator" in answer["values"]
 
 
-def test_what_a_viewer_may_not_call_is_absent_from_rosapi(world: Any) -> None:
-    """rosapi shows a caller only what he may use."""
+def test_forbidden_services_are_absent_from_rosapi(world: Any) -> None:
+    """rosapi lists only services that the caller may use."""
     with world.relay.connect("rover", world.viewer) as client:
         services = client.call("/rosapi/services")["values"]["services"]
         assert all(name.startswith(("/rosapi/", "/relay/")) for name in services)
@@ -71,7 +71,7 @@ def test_what_a_viewer_may_not_call_is_absent_from_rosapi(world: Any) -> None:
 
 
 def test_a_revoked_right_cuts_the_open_channel(world: Any) -> None:
-    """The command line revokes; the websocket that is open ends, with the reason in its close frame."""
+    """The command line revokes it; the open websocket ends with the reason in its close frame."""
     token = world.relay.user("leaver")
     world.relay.cli("right", "grant", "leaver", "rover", "operator")
     with world.relay.connect("rover", token) as client:
@@ -86,7 +86,7 @@ def test_a_revoked_right_cuts_the_open_channel(world: Any) -> None:
 
 
 def test_a_lowered_right_ends_what_it_no_longer_covers(world: Any) -> None:
-    """An operator made viewer keeps his channel, and can't drive any more."""
+    """An operator demoted to viewer keeps the channel, and cannot drive any more."""
     token = world.relay.user("demoted")
     world.relay.cli("right", "grant", "demoted", "rover", "operator")
     with world.relay.connect("rover", token) as client:
@@ -106,7 +106,7 @@ def test_a_lowered_right_ends_what_it_no_longer_covers(world: Any) -> None:
 
 
 def test_a_revoked_token_ends_what_was_opened_with_it(world: Any) -> None:
-    """The token is the credential of the whole connection, not only of its beginning."""
+    """The token authenticates the whole connection, not only its start."""
     token = world.relay.user("tokenless")
     world.relay.cli("right", "grant", "tokenless", "rover", "viewer")
     with world.relay.connect("rover", token) as client:
@@ -121,7 +121,7 @@ def test_a_revoked_token_ends_what_was_opened_with_it(world: Any) -> None:
 
 
 def test_patterns_narrow_and_widen_a_level(world: Any) -> None:
-    """A viewer allowed one service may call it; one denied a topic may not see it."""
+    """A viewer with one allowed service may call it; one with a denied topic does not see it."""
     token = world.relay.user("patterned")
     world.relay.cli(
         "right",

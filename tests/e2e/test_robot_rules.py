@@ -1,4 +1,4 @@
-"""What the robot judges by itself, through a relay and a daemon as they are: its switch, and topics that take goals."""
+"""Decisions of the robot, with an unmodified relay and daemon: its hardware switch, and goals by topic."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from switchboard_client import Client
-from switchboard_processes import ros_environment
-from switchboard_pulse import Pulse
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
 
 from tests.robot_client.ros import Peer
+from tests.worlds.machine_pauses import Pulse
+from tests.worlds.processes import ros_environment
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 GOALS = 12
 PAUSE_SECONDS = 0.37
 """No part of a second in which pings come, nor of one between two of a link that is not commanded."""
 
 
-class Place:
+class ControlWorld:
     """A relay, a robot whose service ``/reset`` stops its hardware and whose topic ``/go`` takes goals."""
 
     def __init__(self, folder: Path) -> None:
         self.relay = Relay(folder)
-        settings = {"STOP_CALL": "/reset", "GOAL_TOPICS": "/go"}
+        settings = {"STOP_SERVICE": "/reset", "GOAL_TOPICS": "/go"}
         environment = {f"SWITCHBOARD_ROBOT_SAFETY_{key}": value for key, value in settings.items()}
         self.robot = Robot(self.relay, "rover", daemon_env=environment)
         self.peer = Peer(ros_environment(self.robot.domain))
@@ -36,42 +36,41 @@ class Place:
         self.relay.cli("right", "grant", "olga", "rover", "owner")
 
     def connect(self, name: str) -> Client:
-        """A connection of one of them."""
+        """A user's connection."""
         return self.relay.connect("rover", self._tokens[name])
 
     def resets(self) -> int:
-        """How often the robot was reset, by its own record."""
+        """The number of resets, by the robot's own log."""
         return len(self.robot.events("reset"))
 
     def goals(self) -> list[str]:
-        """What its node has heard on ``/go``."""
+        """Texts that its node has received on ``/go``."""
         return [each["text"] for each in self.peer.heard("/go")]
 
     def stop(self) -> None:
-        """End everything."""
         self.peer.close()
         self.robot.stop()
         self.relay.stop()
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Iterator[Place]:
-    """One of them."""
-    place = Place(tmp_path)
+def scene(tmp_path: Path) -> Iterator[ControlWorld]:
+    """One for all tests."""
+    scene = ControlWorld(tmp_path)
     try:
-        yield place
+        yield scene
     finally:
-        place.stop()
+        scene.stop()
 
 
 def serves(client: Client, service: str) -> bool:
-    """Whether the robot's graph, as a client is told of it, has a service."""
+    """Whether the robot's graph has a service, for a client."""
     return service in client.call("/rosapi/services")["values"]["services"]
 
 
-def test_only_a_stop_throws_the_switch(place: Place) -> None:
-    """Neither an operator nor an owner who has control can call it, while the robot is stopped or not."""
-    with place.connect("ann") as ann, place.connect("olga") as olga:
+def test_only_a_stop_throws_the_switch(scene: ControlWorld) -> None:
+    """An operator or owner with control cannot call it, whether the robot is stopped or not."""
+    with scene.connect("ann") as ann, scene.connect("olga") as olga:
         wait_for("the owner has control", lambda: olga.call("/relay/take_control")["values"]["success"])
         wait_for("its services are known", lambda: serves(olga, "/reset"))
         for stopped in (False, True):
@@ -81,33 +80,33 @@ def test_only_a_stop_throws_the_switch(place: Place) -> None:
                 answer = client.call("/reset")
                 assert not answer["result"]
                 assert "/relay/resume" in str(answer["values"])
-            assert place.resets() == stopped
+            assert scene.resets() == stopped
 
 
-def test_goals_arrive_whenever_they_are_given(place: Place) -> None:
-    """All of them, though the driver moves nothing else: not one waits for a ping that is due much later."""
-    place.peer.do("listen", "/go", "string")
-    with place.connect("ann") as ann:
+def test_goals_arrive_whenever_they_are_given(scene: ControlWorld) -> None:
+    """All of them, even if the driver sends no other command: none has to wait for a much later ping."""
+    scene.peer.do("listen", "/go", "string")
+    with scene.connect("ann") as ann:
         wait_for("she has control", lambda: ann.call("/relay/take_control")["values"]["success"])
         ann.send(op="advertise", topic="/go", type="std_msgs/String")
 
         def arrives() -> bool:
             ann.send(op="publish", topic="/go", msg={"data": "first"})
-            return bool(place.goals())
+            return bool(scene.goals())
 
         wait_for("the robot's publisher is known", arrives)
         rounds = itertools.count()
 
         def all_arrive() -> bool:
-            """All of one round, unless the machine stood still: then one may have come too late to be taken."""
+            """All of one round arrive, unless the machine stalled: then one may be too late."""
             name = f"round {next(rounds)}"
             given = [f"{name}, goal {number}" for number in range(GOALS)]
 
             def come() -> bool:
-                return [each for each in place.goals() if each.startswith(name)] == given
+                return [each for each in scene.goals() if each.startswith(name)] == given
 
             with Pulse() as pulse:
-                # What is proved is that a goal comes at whatever time it is given.
+                # Any time of sending must work.
                 for each in given:
                     time.sleep(PAUSE_SECONDS)
                     ann.send(op="publish", topic="/go", msg={"data": each})

@@ -1,4 +1,4 @@
-"""All of rosapi, asked by unmodified clients about real nodes with types the relay has never seen."""
+"""All of rosapi, called by unmodified clients for real nodes with types unknown to the relay."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment, running
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import wait_for
 
 from relay_server.relay_node.interfaces import SERVICES
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 TESTS = Path(__file__).parents[1]
 CLIENTS = Path(__file__).parent / "clients"
@@ -67,14 +67,14 @@ PARAMETER_SERVICES = ("get_parameters", "set_parameters", "list_parameters")
 
 
 def run(*command: str) -> dict[str, Any]:
-    """What a client saw."""
+    """The results of a client."""
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
 def lengths(typedef: dict[str, Any]) -> dict[str, int]:
-    """Length of each field's array."""
+    """The length of each field's array."""
     return dict(zip(typedef["fieldnames"], typedef["fieldarraylen"], strict=True))
 
 
@@ -118,58 +118,60 @@ def test_roslibpy_asks_every_service_of_rosapi(lab: Any) -> None:
     script = str(CLIENTS / "rosapi_with_roslibpy.py")
     url = lab.relay.url("rover")
     seen = run(sys.executable, script, url, lab.operator, json.dumps(calls), json.dumps(CHANGES))
-    told = {name: answer for (name, _), answer in zip(QUESTIONS, seen["answers"], strict=True)}
-    _says_what_is_there(told)
-    _says_what_types_are(told)
-    assert told["get_param"] == {"value": "5", "successful": True, "reason": ""}
-    assert told["has_param"] == {"exists": True}
-    assert told["set_param"]["successful"] is False
-    assert "read-only" in told["set_param"]["reason"]
-    assert told["delete_param"]["successful"] is False
-    assert told["delete_param"]["reason"]
+    reported = {name: answer for (name, _), answer in zip(QUESTIONS, seen["answers"], strict=True)}
+    _says_what_is_there(reported)
+    _says_what_types_are(reported)
+    assert reported["get_param"] == {"value": "5", "successful": True, "reason": ""}
+    assert reported["has_param"] == {"exists": True}
+    assert reported["set_param"]["successful"] is False
+    assert "read-only" in reported["set_param"]["reason"]
+    assert reported["delete_param"]["successful"] is False
+    assert reported["delete_param"]["reason"]
     assert {"/lab/arm:limits.low", "/vault/safe:code", "/switchboard_sim:max_speed"} <= set(seen["names"])
     assert abs(seen["time"] - time.time()) < 60
-    assert told["get_ros_version"] == {"version": 2, "distro": "jazzy"}
+    assert reported["get_ros_version"] == {"version": 2, "distro": "jazzy"}
     for (name, new), before in zip(CHANGES, BEFORE, strict=True):
         assert seen["values"][name] == [before, new, before], name
 
 
-def _says_what_is_there(told: dict[str, Any]) -> None:
-    topics = dict(zip(told["topics"]["topics"], told["topics"]["types"], strict=True))
+def _says_what_is_there(reported: dict[str, Any]) -> None:
+    topics = dict(zip(reported["topics"]["topics"], reported["topics"]["types"], strict=True))
     assert topics["/lab/nested"] == NESTED
     assert topics["/relay/status"] == "switchboard_msgs/msg/Status"
     assert not [name for name in topics if "/_" in name]
-    assert set(told["topics_for_type"]["topics"]) == {"/lab/nested", "/vault/gold"}
-    assert told["topic_type"] == {"type": NESTED}
-    raw = told["topics_and_raw_types"]
+    assert set(reported["topics_for_type"]["topics"]) == {"/lab/nested", "/vault/gold"}
+    assert reported["topic_type"] == {"type": NESTED}
+    raw = reported["topics_and_raw_types"]
     text = raw["typedefs_full_text"][raw["topics"].index("/lab/nested")]
     assert "PoseWithCovariance pose" in text
     assert f"{'=' * 80}\nMSG: geometry_msgs/PoseWithCovariance\n" in text
     scan = raw["typedefs_full_text"][raw["topics"].index("/scan")]
     assert "float32[] ranges" in scan
-    services = set(told["services"]["services"])
+    services = set(reported["services"]["services"])
     assert {"/lab/everything", "/reset", *SERVICES} <= services
     assert not [name for name in services if "/_" in name]
-    assert told["services_for_type"] == {"services": ["/lab/everything"]}
-    assert told["service_type"] == {"type": EVERYTHING}
-    assert told["service_node"] == {"node": "/lab/arm"}
-    assert told["service_providers"] == {"providers": ["/lab/arm"]}
-    assert {"/lab/arm", "/vault/safe", "/switchboard_sim", "/relay", "/rosapi"} <= set(told["nodes"]["nodes"])
-    assert "/lab/in" in told["node_details"]["subscribing"]
-    assert "/lab/nested" in told["node_details"]["publishing"]
-    assert "/lab/everything" in told["node_details"]["services"]
-    assert told["publishers"] == {"publishers": ["/lab/arm"]}
-    assert told["subscribers"] == {"subscribers": ["/lab/arm"]}
-    assert told["action_servers"] == {"action_servers": ["/lab/walk", "/vault/dig"]}
-    assert told["action_type"] == {"type": WALK}
-    interfaces = told["interfaces"]["interfaces"]
+    assert reported["services_for_type"] == {"services": ["/lab/everything"]}
+    assert reported["service_type"] == {"type": EVERYTHING}
+    assert reported["service_node"] == {"node": "/lab/arm"}
+    assert reported["service_providers"] == {"providers": ["/lab/arm"]}
+    assert {"/lab/arm", "/vault/safe", "/switchboard_sim", "/relay", "/rosapi"} <= set(
+        reported["nodes"]["nodes"]
+    )
+    assert "/lab/in" in reported["node_details"]["subscribing"]
+    assert "/lab/nested" in reported["node_details"]["publishing"]
+    assert "/lab/everything" in reported["node_details"]["services"]
+    assert reported["publishers"] == {"publishers": ["/lab/arm"]}
+    assert reported["subscribers"] == {"subscribers": ["/lab/arm"]}
+    assert reported["action_servers"] == {"action_servers": ["/lab/walk", "/vault/dig"]}
+    assert reported["action_type"] == {"type": WALK}
+    interfaces = reported["interfaces"]["interfaces"]
     assert {NESTED, EVERYTHING, WALK, "std_msgs/msg/String", "rosapi_msgs/srv/Topics"} <= set(interfaces)
     assert interfaces == sorted(interfaces)
 
 
-def _says_what_types_are(told: dict[str, Any]) -> None:
-    typedefs = {each["type"].partition("/")[2]: each for each in told["message_details"]["typedefs"]}
-    nested = told["message_details"]["typedefs"][0]
+def _says_what_types_are(reported: dict[str, Any]) -> None:
+    typedefs = {each["type"].partition("/")[2]: each for each in reported["message_details"]["typedefs"]}
+    nested = reported["message_details"]["typedefs"][0]
     assert nested["type"] == "switchboard_test_interfaces/Nested"
     assert lengths(nested) == {
         "header": -1, "primitives": -1, "arrays": 2, "sequences": 0, "bounded": 0, "nothing": -1, "times": 0,
@@ -201,15 +203,15 @@ def _says_what_types_are(told: dict[str, Any]) -> None:
         "action_feedback_details": ("Everything_Feedback", {"step": -1, "feedback": -1}),
     }
     for service, (name, fields) in parts.items():
-        first, second = told[service]["typedefs"][:2]
+        first, second = reported[service]["typedefs"][:2]
         assert first["type"] == f"switchboard_test_interfaces/{name}"
         assert lengths(first) == fields
         assert second == nested
-    assert told["service_request_details"]["typedefs"][0]["constnames"] == ["PLAIN"]
+    assert reported["service_request_details"]["typedefs"][0]["constnames"] == ["PLAIN"]
 
 
 def test_roslib_js_asks_with_all_its_helpers(lab: Any) -> None:
-    """Lists, types, nodes, actions and parameters, as roslib.js has them."""
+    """Lists, types, nodes, actions and parameters, with roslib.js's helpers."""
     node = [str(TESTS.parent / "scripts" / "with-node.sh"), "node", str(CLIENTS / "rosapi_with_roslib.mjs")]
     seen = run(*node, str(ROSLIB), lab.relay.url("rover"), lab.operator, json.dumps(CHANGES))
     assert "/lab/nested" in seen["topics"]["topics"]
@@ -241,7 +243,7 @@ def test_roslib_js_asks_with_all_its_helpers(lab: Any) -> None:
 
 @pytest.fixture(scope="module")
 def guest(lab: Any) -> Iterator[Client]:
-    """An operator to whom the vault is denied."""
+    """An operator without rights on the vault."""
     token = lab.relay.user("guest")
     lab.relay.cli("right", "grant", "guest", "rover", "operator", "--deny", "*:/vault/*")
     with lab.relay.connect("rover", token) as client:
@@ -253,7 +255,7 @@ VAULT = {"topic": "/vault/gold", "service": "/vault/open", "action": "/vault/dig
 
 @pytest.mark.parametrize("name", [name for name, _ in QUESTIONS])
 def test_no_answer_shows_what_is_denied(guest: Client, name: str) -> None:
-    """Nodes are seen, because they publish what all may hear; nothing they do in the vault is."""
+    """The nodes are listed because of their public topics; their names in the vault are not."""
     kinds = dict.fromkeys(
         ("service_request_details", "service_response_details", "services_for_type"), EVERYTHING
     )
@@ -261,7 +263,7 @@ def test_no_answer_shows_what_is_denied(guest: Client, name: str) -> None:
     answer = guest.call(f"/rosapi/{name}", {**VAULT, "node": "/vault/safe", "type": kind, "value": "1"})
     assert answer["result"] is True, answer
     values = answer["values"]
-    # A refusal repeats what was asked for, whether it exists or not.
+    # A refusal repeats the requested name, whether it exists or not.
     assert ("is denied to you" in values.pop("reason", "")) is (values.get("successful") is False)
     assert values.get("exists") is not True
     text = json.dumps(values)
@@ -271,7 +273,7 @@ def test_no_answer_shows_what_is_denied(guest: Client, name: str) -> None:
 
 
 def test_a_viewer_has_no_parameters(lab: Any) -> None:
-    """He may call nothing: the reason says so, and no name is listed."""
+    """Viewers may call no service: the error says so, and no name is listed."""
     with lab.relay.connect("rover", lab.viewer) as client:
         answer = client.call("/rosapi/get_param", {"name": "/lab/arm:speed"})["values"]
         assert answer["successful"] is False
@@ -279,8 +281,10 @@ def test_a_viewer_has_no_parameters(lab: Any) -> None:
         assert client.call("/rosapi/get_param_names")["values"] == {"names": []}
 
 
-def test_what_a_client_offers_is_seen_by_others(lab: Any) -> None:
-    """The robot leaves its daemon out of the graph it tells; the relay stands for it. It goes with the client."""
+def test_services_of_a_client_are_seen_by_others(lab: Any) -> None:
+    """The robot leaves its own daemon out of its graph; the relay's node has the service until the client
+    leaves.
+    """
     with lab.relay.connect("rover", lab.operator) as other:
 
         def node_of(service: str) -> str:
@@ -302,8 +306,8 @@ def test_what_a_client_offers_is_seen_by_others(lab: Any) -> None:
         wait_for("the service is gone", lambda: node_of("/lab/offered") == "")
 
 
-def test_a_node_that_is_frozen_hangs_nobody(lab: Any, tmp_path: Path) -> None:
-    """Its parameters are left out, the others are listed all the same."""
+def test_a_frozen_node_blocks_no_client(lab: Any, tmp_path: Path) -> None:
+    """Its parameters are left out, the others are listed."""
     with lab.relay.connect("rover", lab.operator) as client:
         lab.robot.sim.signal(19)
         try:
@@ -315,7 +319,9 @@ def test_a_node_that_is_frozen_hangs_nobody(lab: Any, tmp_path: Path) -> None:
 
 
 def test_the_relays_time_of_a_simulated_robot_is_that_of_its_clock(tmp_path: Path) -> None:
-    """A simulator that drives ``/clock`` through the relay sets get_time, and stamps that clients leave out."""
+    """A simulator that publishes ``/clock`` through the relay determines get_time, and stamps that clients
+    leave out.
+    """
     config = tmp_path / "robot.toml"
     config.write_text("[ros]\nuse_sim_time = true\n")
     relay = Relay(tmp_path / "relay")

@@ -1,4 +1,4 @@
-"""What is read of a resource can be sent back as it is, byte by byte, in every form; and it says the same then."""
+"""A resource's body can be sent back byte by byte, in every format, with the same meaning."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 from pyld import jsonld
 from rdflib import XSD, Graph, Literal
 from rdflib.compare import isomorphic
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment, running
-from switchboard_waiting import wait_for
 
 from relay_server.http.media_types import FORMS, JSON_LD, TURTLE
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 ROBOT = "/api/v1/robots/rover"
 MEDIA = [each.media for each in FORMS]
@@ -65,13 +65,13 @@ EMPTY: dict[str, dict[str, Any]] = {"nested": {"header": {"stamp": {"sec": 1}}},
 
 @pytest.fixture
 def client(world: Any) -> Iterator[httpx.Client]:
-    """Requests of who may drive."""
+    """Requests of an operator."""
     with world.over_http() as client:
         yield client
 
 
 def get(client: httpx.Client, address: str, media: str) -> httpx.Response:
-    """What there is, in a form."""
+    """A resource in a format."""
     answer = client.get(
         address, headers={"Accept": media}, params={"wait": 0.5} if "topics" in address else {}
     )
@@ -81,28 +81,30 @@ def get(client: httpx.Client, address: str, media: str) -> httpx.Response:
 
 
 def value(client: httpx.Client, address: str) -> Any:
-    """What a resource says, ``None`` while it says nothing."""
+    """A resource's value, ``None`` while it has none."""
     return get(client, address, "application/json").json().get("value")
 
 
 def send_back(client: httpx.Client, address: str, read: httpx.Response) -> None:
-    """Send what was read, as it is."""
+    """Sends the body that was read."""
     headers = {"Content-Type": read.headers["content-type"]}
     answer = client.put(address, content=read.content, headers=headers)
     assert answer.status_code == 204, answer.text
 
 
 def said(speaker: Client, client: httpx.Client, topic: str, which: str) -> tuple[Any, Any]:
-    """Have one of the messages said on a topic, and nothing after it; what an empty one says, and what it says."""
+    """Publishes one of the messages on a topic as its last; returns the values of an empty message and of
+    this one.
+    """
     type_name, message = MESSAGES[which]
     speaker.send(op="advertise", topic=topic, type=type_name)
 
-    def heard() -> Any:
+    def received() -> Any:
         speaker.send(op="publish", topic=topic, msg=EMPTY[which])
         return value(client, f"topics{topic}")
 
-    # Again and again, until all have found each other.
-    empty = wait_for("something is heard", heard)
+    # Repeated until DDS has matched all.
+    empty = wait_for("something is heard", received)
     speaker.send(op="publish", topic=topic, msg=message)
 
     def changed() -> Any:
@@ -114,9 +116,9 @@ def said(speaker: Client, client: httpx.Client, topic: str, which: str) -> tuple
 
 @pytest.mark.parametrize("media", MEDIA)
 @pytest.mark.parametrize("which", MESSAGES)
-def test_what_a_topic_said_is_said_again(world: Any, client: httpx.Client, which: str, media: str) -> None:
-    """After something else was said; the state is the same as when it was read."""
-    # Its own: what was said there before must not be taken for what is said now.
+def test_latched_sample_is_sent_again(world: Any, client: httpx.Client, which: str, media: str) -> None:
+    """After another message; the state equals the one that was read."""
+    # Its own topic: earlier messages must not count as new.
     topic = f"/round/trip_{which}_{MEDIA.index(media)}"
     address = f"topics{topic}"
     with world.relay.connect("rover", world.operator) as speaker:
@@ -131,7 +133,7 @@ def test_what_a_topic_said_is_said_again(world: Any, client: httpx.Client, which
 
 @pytest.fixture(scope="module")
 def arm(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A node with parameters of all types; the beginning of their addresses."""
+    """A node with parameters of all types; returns the prefix of their addresses."""
     command = [sys.executable, str(PEER)]
     folder, environment = tmp_path_factory.mktemp("peer"), ros_environment(world.robot.domain)
     peer = Process(command, folder, "peer", environment)
@@ -141,8 +143,8 @@ def arm(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("media", MEDIA)
-def test_what_a_parameter_was_is_set_again(client: httpx.Client, arm: str, media: str) -> None:
-    """After it was something else: a word, a number, and arrays."""
+def test_read_parameter_can_be_written_back(client: httpx.Client, arm: str, media: str) -> None:
+    """After other values: a string, a number, and arrays."""
     others = {"title": "neu", "speed": 2.5, "flags": [False], "counts": [], "speeds": [7.0], "titles": ["x"]}
     for name, other in others.items():
         address = f"{arm}{name}"
@@ -155,8 +157,8 @@ def test_what_a_parameter_was_is_set_again(client: httpx.Client, arm: str, media
         assert value(client, address) == before
 
 
-def test_what_is_of_another_resource_is_refused(client: httpx.Client, arm: str) -> None:
-    """In words, in every form: it was meant for that one."""
+def test_body_about_another_resource_is_refused(client: httpx.Client, arm: str) -> None:
+    """With a reason, in every format."""
     wait_for("its node is known", lambda: value(client, f"{arm}speed") is not None)
     for media in MEDIA:
         for there, elsewhere in (
@@ -167,15 +169,18 @@ def test_what_is_of_another_resource_is_refused(client: httpx.Client, arm: str) 
             headers = {"Content-Type": read.headers["content-type"]}
             answer = client.put(elsewhere, content=read.content, headers=headers)
             assert answer.status_code == 400, (media, elsewhere, answer.text)
-            assert "another" in answer.json()["detail"] or "resource itself" in answer.json()["detail"]
+            assert (
+                "of this address" in answer.json()["detail"] or "resource itself" in answer.json()["detail"]
+            )
 
 
 # --- JSON-LD by another processor ---------------------------------------------------------------------------
 
 
 def plain(graph: Graph) -> Graph:
-    """The same graph, with one way to write each value: words are of one datatype, whether or not that is said (RDF 1.1
-    Concepts section 3.3), and PyLD writes doubles its own way, with 16 digits."""
+    """The same graph with one notation per value: a string's datatype may be left out (RDF 1.1 Concepts
+    section 3.3), and PyLD writes doubles with 16 digits.
+    """
     made = Graph()
     for subject, predicate, value in graph:
         if isinstance(value, Literal) and value.datatype == XSD.string:
@@ -187,7 +192,7 @@ def plain(graph: Graph) -> Graph:
 
 
 def see_same(client: httpx.Client, address: str) -> Graph:
-    """See that PyLD makes the same of a resource in JSON-LD as rdflib of it in Turtle; what that is."""
+    """Checks that PyLD reads a resource in JSON-LD as rdflib reads it in Turtle; returns the graph."""
     turtle, linked = get(client, address, TURTLE.media), get(client, address, JSON_LD.media)
     assert (turtle.status_code, linked.status_code) == (200, 200), turtle.text
     here = f"http://127.0.0.1:{client.base_url.port}/"
@@ -213,7 +218,7 @@ def see_same(client: httpx.Client, address: str) -> Graph:
 
 @pytest.mark.parametrize("which", MESSAGES)
 def test_another_processor_reads_the_same_of_a_state(world: Any, client: httpx.Client, which: str) -> None:
-    """With the context in the answer; no other host is asked for anything."""
+    """With the context in the answer; no other host is contacted."""
     topic = f"/round/linked_{which}"
     with world.relay.connect("rover", world.operator) as speaker:
         said(speaker, client, topic, which)
@@ -226,23 +231,21 @@ def test_another_processor_reads_the_same_of_a_state(world: Any, client: httpx.C
         "params/lab/arm:titles",
         "services?name=/lab/*",
         "cameras",
-        "modules/lab/arm",
+        "nodes/lab/arm",
         "/api/v1/vocabulary/switchboard",
         "/api/v1/vocabulary/fields",
         "/api/v1/vocabulary/nav_msgs/Odometry",
     ],
 )
 def test_another_processor_reads_the_same_of_all_else(client: httpx.Client, arm: str, address: str) -> None:
-    """Parameters, collections, their members, and the words themselves."""
+    """Parameters, collections, their members, and the vocabulary."""
     if address.startswith("/"):
-        # Told by the robot with the first message of it.
+        # The robot sends it with its first message.
         assert (
             client.get("topics/odom", params={"wait": 60}, headers={"Accept": TURTLE.media}).status_code
             == 200
         )
         address = f"http://127.0.0.1:{client.base_url.port}{address}"
-    wait_for(
-        "its node is known", lambda: get(client, "modules/lab/arm", "application/json").status_code == 200
-    )
+    wait_for("its node is known", lambda: get(client, "nodes/lab/arm", "application/json").status_code == 200)
     wait_for("it is there", lambda: get(client, address, TURTLE.media).status_code == 200)
     assert len(see_same(client, address)) > 2

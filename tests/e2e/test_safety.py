@@ -1,6 +1,6 @@
-"""Whatever breaks while a robot is driven, it stands still within half a second, by its own record.
+"""After any failure during a drive, the robot stands within 0.5 s, by its own log.
 
-The simulator keeps its last command for ever, as many bases do: what stops it is the daemon's watchdog or its guard.
+The simulator keeps its last command forever, as many bases do: the daemon's watchdog or its guard stops it.
 """
 
 from __future__ import annotations
@@ -11,15 +11,16 @@ from collections.abc import Callable, Iterator
 
 import psutil
 import pytest
-from switchboard_client import Client
-from switchboard_drive import LET_GO_SECONDS, Drive
-from switchboard_threads import Driver, Returning
-from switchboard_waiting import wait_for
+
+from tests.worlds.client_threads import Driver, Returning
+from tests.worlds.driving import LET_GO_SECONDS, Drive
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
-    """One drive for all faults: each test leaves it whole again."""
+    """One drive for all faults: each test leaves it intact."""
     drive = Drive(tmp_path_factory.mktemp("drive"))
     try:
         yield drive
@@ -29,7 +30,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
 
 @pytest.mark.parametrize("fault", ["client vanishes", "client link black hole", "client link reset"])
 def test_the_robot_stands_when_its_driver_is_lost(drive: Drive, fault: str) -> None:
-    """A client that goes away, with or without a word, leaves the robot standing."""
+    """A client that disconnects, with or without a close, leaves the robot standing."""
     driver = drive.start_driving()
     act: dict[str, Callable[[], None]] = {
         "client vanishes": driver.stop,
@@ -46,7 +47,7 @@ def test_the_robot_stands_when_its_driver_is_lost(drive: Drive, fault: str) -> N
 
 @pytest.mark.parametrize("fault", ["robot link black hole", "robot link reset", "relay to robot only"])
 def test_the_robot_stands_when_its_link_is_lost(drive: Drive, fault: str) -> None:
-    """A robot that hears nothing more stands, also when nobody told it that the link is dead."""
+    """A robot without input stands, even if it has not noticed the dead link."""
     driver = drive.start_driving()
     act: dict[str, Callable[[], None]] = {
         "robot link black hole": drive.robot_side.black_hole,
@@ -61,10 +62,10 @@ def test_the_robot_stands_when_its_link_is_lost(drive: Drive, fault: str) -> Non
     drive.again()
 
 
-def moves_only_after_letting_go(drive: Drive, driver: Driver, since: int) -> None:
-    """Whoever has driven on across a fault moves nothing, however long; half a second of silence is letting go."""
+def moves_only_after_release(drive: Drive, driver: Driver, since: int) -> None:
+    """Continued commands across a fault move nothing for any time; a pause of 0.5 s is a release."""
     drive.robot.wait_online()
-    # For six seconds: within five the robot takes the first command it hears for the going on of those before it.
+    # For 6 s: within 5 s the robot takes a new command for a continuation of earlier ones.
     enough = driver.sent + 60
     wait_for("it has been commanded on and on", lambda: driver.sent >= enough)
     assert [each for each in drive.robot.events("command", since) if each["v"] or each["w"]] == []
@@ -75,8 +76,8 @@ def moves_only_after_letting_go(drive: Drive, driver: Driver, since: int) -> Non
     drive.stands()
 
 
-def test_who_drives_on_across_a_lost_robot_link_moves_nothing_before_he_lets_go(drive: Drive) -> None:
-    """His connection never broke; when the robot is back, control is taken anew."""
+def test_commanding_across_a_lost_robot_link_requires_a_release(drive: Drive) -> None:
+    """The driver's connection stays open; when the robot is back, control is taken again."""
     driver = drive.start_driving()
     broken = time.monotonic_ns()
     drive.robot_side.black_hole()
@@ -84,21 +85,19 @@ def test_who_drives_on_across_a_lost_robot_link_moves_nothing_before_he_lets_go(
     wait_for("its link is lost", lambda: drive.relay.state_of("rover") == "offline")
     healed = time.monotonic_ns()
     drive.robot_side.heal()
-    moves_only_after_letting_go(drive, driver, healed)
+    moves_only_after_release(drive, driver, healed)
     assert driver.broken is None
     drive.again()
 
 
 @pytest.mark.parametrize("away", [0.0, 1.5])
-def test_who_drives_on_across_a_loss_of_his_connection_moves_nothing_before_he_lets_go(
-    drive: Drive, away: float
-) -> None:
-    """Also where he was away for longer than letting go takes: as long as he was not there he let go of nothing."""
+def test_commanding_across_a_lost_connection_requires_a_release(drive: Drive, away: float) -> None:
+    """Even after an absence longer than the required pause: without a connection there is no release."""
     lost = 0
 
     def connect() -> Client:
         if lost:
-            time.sleep(away)  # so long a library waits before it connects anew
+            time.sleep(away)  # a library's delay before it reconnects
         return drive.relay.connect_by(drive.client_side.port, "rover", drive.token)
 
     driver = Returning(connect)
@@ -109,15 +108,13 @@ def test_who_drives_on_across_a_loss_of_his_connection_moves_nothing_before_he_l
     stood = time.monotonic_ns()
     drive.client_side.heal()
     wait_for("the driver is back", lambda: driver.connections > 1)
-    moves_only_after_letting_go(drive, driver, stood)
+    moves_only_after_release(drive, driver, stood)
     drive.again()
 
 
 @pytest.mark.parametrize("who_is_first", ["driver", "robot"])
-def test_who_drives_on_across_a_restart_of_the_relay_moves_nothing_before_he_lets_go(
-    drive: Drive, who_is_first: str
-) -> None:
-    """By a new connection, whether the robot is there before him or not: what it says to nobody is no letting go."""
+def test_commanding_across_a_relay_restart_requires_a_release(drive: Drive, who_is_first: str) -> None:
+    """By a new connection, before or after the robot's: commands without a receiver are no release."""
     killed = 0
 
     def connect() -> Client:
@@ -139,21 +136,21 @@ def test_who_drives_on_across_a_restart_of_the_relay_moves_nothing_before_he_let
     wait_for("he commands", lambda: driver.sent >= enough)
     if who_is_first == "driver":
         drive.robot_side.heal()
-    moves_only_after_letting_go(drive, driver, stood)
+    moves_only_after_release(drive, driver, stood)
     drive.again()
 
 
 def test_no_command_from_before_a_partition_is_executed_after_it(drive: Drive) -> None:
-    """Commands that a network held back for two seconds arrive and are dropped."""
+    """Commands that a network delayed for two seconds arrive and are dropped."""
     driver = drive.start_driving()
     drive.robot_side.forward_down.clear()
     time.sleep(1.5)  # commands pile up on their way to the robot
     driver.stop()
-    time.sleep(0.6)  # the last of them grows older than its deadline
+    time.sleep(0.6)  # the last of them exceeds its deadline
     healed = time.monotonic_ns()
     drive.robot_side.heal()
     with drive.relay.connect("rover", drive.token) as client:
-        # The answer comes behind everything that was held back.
+        # The answer arrives after all delayed messages.
         wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"])
     late = [each for each in drive.robot.events("command", healed) if each["v"] or each["w"]]
     assert late == []
@@ -164,7 +161,7 @@ def test_no_command_from_before_a_partition_is_executed_after_it(drive: Drive) -
 def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_when_it_wakes(
     drive: Drive,
 ) -> None:
-    """Commands that waited in a frozen relay's sockets are older than their deadline, and the relay knows."""
+    """Commands that waited in a frozen relay's sockets have exceeded their deadline, and the relay notices."""
     driver = drive.start_driving()
     since = time.monotonic_ns()
     drive.relay.freeze()
@@ -172,7 +169,7 @@ def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_whe
         drive.stands_within_limit(since)
         time.sleep(1.0)  # the client goes on sending into the frozen relay's socket
         driver.stop()
-        time.sleep(0.6)  # the last command grows older than its deadline
+        time.sleep(0.6)  # the last command exceeds its deadline
     finally:
         woken = time.monotonic_ns()
         drive.relay.thaw()
@@ -185,7 +182,7 @@ def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_whe
 
 
 def test_the_robot_stands_when_the_relay_is_killed_and_all_is_back_after_its_restart(drive: Drive) -> None:
-    """kill -9 of the relay: the robot stands; a new relay on the same data finds its robot again."""
+    """After kill -9 of the relay the robot stands; a new relay on the same data gets the robot back."""
     driver = drive.start_driving()
     since = time.monotonic_ns()
     drive.relay.kill()
@@ -196,7 +193,7 @@ def test_the_robot_stands_when_the_relay_is_killed_and_all_is_back_after_its_res
 
 
 def test_the_robot_stands_when_its_daemon_is_killed(drive: Drive) -> None:
-    """kill -9 of the daemon: the guard outlives it and stops the robot."""
+    """After kill -9 of the daemon its guard stops the robot."""
     driver = drive.start_driving()
     since = time.monotonic_ns()
     drive.robot.daemon.kill()
@@ -207,14 +204,14 @@ def test_the_robot_stands_when_its_daemon_is_killed(drive: Drive) -> None:
 
 
 def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
-    """A daemon that hangs with its links open is stopped by the guard, and is itself again when it wakes."""
+    """The guard stops the robot of a frozen daemon with open links; the daemon recovers when it continues."""
     driver = drive.start_driving()
     since = time.monotonic_ns()
     drive.robot.daemon.freeze()
     try:
         drive.stands_within_limit(since)
         driver.stop()
-        time.sleep(0.6)  # the last command grows older than its deadline
+        time.sleep(0.6)  # the last command exceeds its deadline
     finally:
         woken = time.monotonic_ns()
         drive.robot.daemon.signal(signal.SIGCONT)
@@ -226,8 +223,10 @@ def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
     drive.again()
 
 
-def test_nobody_waits_for_a_frozen_daemons_memory(drive: Drive) -> None:
-    """Daemon and guard share no memory with other nodes: one frozen with its lock in hand would hold up the base."""
+def test_frozen_daemons_memory_is_not_waited_for(drive: Drive) -> None:
+    """Daemon and guard use no shared memory with other nodes: a process frozen with a lock would block the
+    base.
+    """
     daemon = psutil.Process(drive.robot.daemon.popen.pid)
     guards = [each for each in daemon.children() if "robot_client.motion.guard" in each.cmdline()]
     assert guards

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment, running
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_waiting import PATIENCE, wait_for
 
 from tests.robot_client.ros import Peer
+from tests.worlds.processes import Process, ros_environment, running
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import PATIENCE, wait_for
 
 CLIENTS = Path(__file__).parent / "clients"
 EVERYTHING = "switchboard_test_interfaces/srv/Everything"
@@ -25,14 +25,14 @@ ADD = "example_interfaces/srv/AddTwoInts"
 
 @pytest.fixture(scope="module")
 def peer(world: Any) -> Iterator[Peer]:
-    """A node of the robot, in a process of its own."""
+    """A node of the robot, in its own process."""
     peer = Peer(ros_environment(world.robot.domain))
     yield peer
     peer.close()
 
 
 def adds(client: Client, service: str, seconds: float = PATIENCE) -> dict[str, Any]:
-    """Answer the next call with the sum; returns the call."""
+    """Answers the next call with the sum; returns the call."""
     call = client.until(seconds, op="call_service", service=service)
     values = {"sum": call["args"]["a"] + call["args"]["b"]}
     client.send(op="service_response", service=service, id=call["id"], values=values, result=True)
@@ -40,7 +40,7 @@ def adds(client: Client, service: str, seconds: float = PATIENCE) -> dict[str, A
 
 
 def called_again(peer: Peer, client: Client) -> dict[str, Any] | None:
-    """Have the node call once more; the call, if it came."""
+    """Makes the node call once more; returns the call if it arrived."""
     peer.do("call", "/again", 3, 4)
     try:
         return client.until(2.0, op="call_service", args={"a": 3, "b": 4})
@@ -49,32 +49,35 @@ def called_again(peer: Peer, client: Client) -> dict[str, Any] | None:
 
 
 def everything(world: Any, what: str, name: str) -> list[str]:
-    """The command of a node that knows every kind of field."""
+    """The command of a node with every kind of field."""
     return [sys.executable, str(CLIENTS / "everything_peer.py"), what, name]
 
 
 def test_a_node_calls_a_service_of_a_client(world: Any, peer: Peer) -> None:
-    """As often as it likes, also several calls at a time, answered in any order."""
+    """Repeatedly, also several calls at a time, answered in any order."""
     with world.operating() as client:
         client.send(op="advertise_service", service="/sum", type="example_interfaces/AddTwoInts")
         peer.do("call", "/sum", 2, 3)
         call = adds(client, "/sum")
         assert call.keys() == {"op", "id", "service", "args"}
         assert call["args"] == {"a": 2, "b": 3}
-        peer.until(lambda: peer.told("answer", "/sum"))
-        assert peer.told("answer", "/sum")[0]["sum"] == 5
+        peer.until(lambda: peer.reported("answer", "/sum"))
+        assert peer.reported("answer", "/sum")[0]["sum"] == 5
         peer.do("call", "/sum", 10, 1)
         peer.do("call", "/sum", 20, 2)
         calls = [client.until(op="call_service") for _ in range(2)]
         for each in reversed(calls):
             values = {"sum": each["args"]["a"] + each["args"]["b"]}
             client.send(op="service_response", service="/sum", id=each["id"], values=values)
-        peer.until(lambda: len(peer.told("answer", "/sum")) == 3)
-        assert {(each["a"], each["sum"]) for each in peer.told("answer", "/sum")[1:]} == {(10, 11), (20, 22)}
+        peer.until(lambda: len(peer.reported("answer", "/sum")) == 3)
+        assert {(each["a"], each["sum"]) for each in peer.reported("answer", "/sum")[1:]} == {
+            (10, 11),
+            (20, 22),
+        }
 
 
 def test_every_kind_of_field_passes(world: Any) -> None:
-    """Out of the graph into JSON and back into the graph, unchanged."""
+    """From the graph to JSON and back, unchanged."""
     with world.operating() as client:
         client.send(op="advertise_service", service="/mirror", type=EVERYTHING)
         node = subprocess.Popen(
@@ -101,7 +104,7 @@ def test_every_kind_of_field_passes(world: Any) -> None:
 
 
 def test_a_client_calls_a_service_with_every_kind_of_field(world: Any, tmp_path: Path) -> None:
-    """What it sends comes back as it was."""
+    """It returns unchanged."""
     node = Process(
         everything(world, "serve", "/nodes_mirror"), tmp_path, "node", ros_environment(world.robot.domain)
     )
@@ -120,7 +123,7 @@ def test_a_client_calls_a_service_with_every_kind_of_field(world: Any, tmp_path:
 
 
 def test_a_client_that_leaves_takes_its_service_along(world: Any, peer: Peer) -> None:
-    """The one call is lost, as with any node that dies; the next client's service is found and answers."""
+    """The pending call is lost, as with any node that dies; the next client's service is found and answers."""
     with world.operating() as client:
         client.send(op="advertise_service", service="/brief", type=ADD)
         peer.do("call", "/brief", 1, 1)
@@ -130,15 +133,15 @@ def test_a_client_that_leaves_takes_its_service_along(world: Any, peer: Peer) ->
         client.send(op="advertise_service", service="/brief", type=ADD)
         peer.do("call", "/brief", 2, 2)
         assert adds(client, "/brief")["args"] == {"a": 2, "b": 2}
-        peer.until(lambda: peer.told("answer", "/brief"))
-        assert [each["sum"] for each in peer.told("answer", "/brief")] == [4]
+        peer.until(lambda: peer.reported("answer", "/brief"))
+        assert [each["sum"] for each in peer.reported("answer", "/brief")] == [4]
 
 
 def test_names_that_are_taken_are_refused(world: Any) -> None:
-    """By another client, by the robot, by the relay; and a type the robot does not have."""
+    """By another client, by the robot, by the relay; and with a type that the robot does not have."""
     with world.operating() as first, world.operating() as second:
         first.send(op="advertise_service", service="/taken", type=ADD)
-        # A call of its own shows that the relay has done what was asked before.
+        # A call of its own shows that the relay has handled earlier requests.
         first.send(op="call_service", service="/taken", args={"a": 1})
         adds(first, "/taken")
         for name, type_name, words in (
@@ -152,7 +155,9 @@ def test_names_that_are_taken_are_refused(world: Any) -> None:
 
 
 def test_a_client_calls_a_client(world: Any) -> None:
-    """Answers, failures in words, wrong arguments and a server that vanishes: nobody waits in vain."""
+    """Answers, failures with reasons, invalid arguments and a server that disconnects: every call is
+    answered.
+    """
     with world.operating() as server, world.operating() as caller:
         server.send(op="advertise_service", service="/between", type=ADD)
         server.send(op="call_service", service="/between", id="ready", args=[1])
@@ -180,8 +185,8 @@ def test_a_client_calls_a_client(world: Any) -> None:
         assert (answer["result"], answer["values"]) == (False, "the client that offered /between has left")
 
 
-def test_rights_decide_who_offers_and_who_calls(world: Any) -> None:
-    """A viewer does neither."""
+def test_offering_and_calling_a_service_need_rights(world: Any) -> None:
+    """A viewer has neither."""
     with world.operating() as server, world.relay.connect("rover", world.viewer) as viewer:
         server.send(op="advertise_service", service="/judged", type=ADD)
         viewer.send(op="set_level", level="error")
@@ -191,7 +196,7 @@ def test_rights_decide_who_offers_and_who_calls(world: Any) -> None:
 
 
 def test_an_offer_is_made_again_when_the_robot_is_back(tmp_path: Path) -> None:
-    """The daemon was killed in the middle of a call; the client notices nothing but that."""
+    """The daemon was killed during a call; the client notices only that."""
     relay = Relay(tmp_path, "--heartbeat", "0.5")
     with running(relay):
         token = relay.user("driver")
@@ -208,11 +213,12 @@ def test_an_offer_is_made_again_when_the_robot_is_back(tmp_path: Path) -> None:
                 robot.start_daemon()
                 robot.wait_online()
                 client.send(op="service_response", service="/again", id=lost["id"], values={"sum": 3})
-                # To the node the dead server is there for a while; what it asks meanwhile is lost, as in any ROS graph.
+                # The node sees the dead server for a while; its calls are lost meanwhile, as in any ROS
+                # graph.
                 call = wait_for("a call comes through", lambda: called_again(peer, client), 60)
                 client.send(op="service_response", service="/again", id=call["id"], values={"sum": 7})
-                peer.until(lambda: any(each["a"] == 3 for each in peer.told("answer", "/again")))
-                assert peer.told("answer", "/again")[-1]["sum"] == 7
+                peer.until(lambda: any(each["a"] == 3 for each in peer.reported("answer", "/again")))
+                assert peer.reported("answer", "/again")[-1]["sum"] == 7
         finally:
             peer.close()
             robot.stop()

@@ -1,4 +1,4 @@
-"""What is asked of a database that is slow is done, also when nobody waits for it any more."""
+"""Writes to a slow database are completed, even after the client has left."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from contextlib import closing
 
 import httpx
 import pytest
-from switchboard_relay import Relay
-from switchboard_waiting import PATIENCE, wait_for
+
+from tests.worlds.relay_process import Relay
+from tests.worlds.waiting import PATIENCE, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -22,21 +23,21 @@ def relay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Relay]:
 
 
 def status(relay: Relay, token: str) -> int:
-    """What a session is answered."""
+    """The status of a session's request."""
     url = f"http://127.0.0.1:{relay.http_port}/api/v1/session"
     return httpx.get(url, headers={"Authorization": f"Bearer {token}"}, timeout=PATIENCE).status_code
 
 
 def logs_out(relay: Relay, token: str) -> socket.socket:
-    """Somebody ends his session, as bytes."""
+    """A user logs out, as bytes."""
     connection = socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE)
     head = f"DELETE /api/v1/session HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n\r\n"
     connection.sendall(head.encode())
     return connection
 
 
-def test_who_logs_out_and_closes_the_page_at_once_is_logged_out(relay: Relay) -> None:
-    """Though the database was busy, and the one writer with somebody else."""
+def test_logout_completes_when_the_page_is_closed_at_once(relay: Relay) -> None:
+    """While another write occupies the database."""
     relay.user("ann")
     waits, leaves, witness = (relay.token("ann") for _ in range(3))
     assert {status(relay, each) for each in (waits, leaves, witness)} == {200}
@@ -46,7 +47,7 @@ def test_who_logs_out_and_closes_the_page_at_once_is_logged_out(relay: Relay) ->
         waiting = logs_out(relay, waits)
         assert status(relay, witness) == 200
         logs_out(relay, leaves).close()
-        # Each on a connection of its own: the relay has seen by now that he has left.
+        # Each on its own connection: the relay has seen the disconnection by now.
         assert [status(relay, witness) for _ in range(3)] == [200] * 3
         other.execute("ROLLBACK")
     with waiting:

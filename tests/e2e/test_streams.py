@@ -1,4 +1,4 @@
-"""Streams of all kinds count against one limit per user."""
+"""All kinds of streams count against one limit per user."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_video import known, path
-from switchboard_waiting import PATIENCE, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.video_clients import known, path
+from tests.worlds.waiting import PATIENCE, wait_for
 
 STREAMS = {
     "robots": ("/api/v1/robots/stream", "text/event-stream"),
@@ -25,8 +26,8 @@ STREAMS = {
 WEBSOCKETS = {"pages": "/api/v1/robots/stream", "camera": path("ws")}
 
 
-class House:
-    """A relay on which a user may have one stream."""
+class World:
+    """A relay that allows one stream per user."""
 
     def __init__(self, folder: Any) -> None:
         self.relay = Relay(folder, "--streams-per-user", "1")
@@ -38,21 +39,21 @@ class House:
 
     @contextmanager
     def opened(self, address: str, accept: str) -> Iterator[httpx.Response]:
-        """A stream; it has ended for the relay when this is left."""
+        """An open stream, which the relay has ended on leaving the block."""
         headers = {"Authorization": f"Bearer {self.token}", "Accept": accept}
         url = f"http://127.0.0.1:{self.relay.http_port}{address}"
         with httpx.stream("GET", url, headers=headers, timeout=PATIENCE) as answer:
             yield answer
 
     def status(self, address: str, accept: str) -> int:
-        """What a client that opens one more is answered."""
+        """The status of a further stream."""
         with self.opened(address, accept) as answer:
             if answer.status_code != 200:
                 assert "close one of them first" in answer.read().decode()
             return answer.status_code
 
     def handshake(self, address: str) -> str:
-        """What the handshake of one more is answered."""
+        """The result of a further websocket handshake."""
         try:
             headers = {"Authorization": f"Bearer {self.token}"}
             with connect(
@@ -66,15 +67,14 @@ class House:
         return "open"
 
     def stop(self) -> None:
-        """End everything."""
         self.robot.stop()
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """One for all."""
-    made = House(tmp_path_factory.mktemp("streams"))
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """One for all tests."""
+    made = World(tmp_path_factory.mktemp("streams"))
     try:
         yield made
     finally:
@@ -82,36 +82,36 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 
 
 @pytest.mark.parametrize("kind", [*STREAMS, *WEBSOCKETS])
-def test_a_stream_of_each_kind_counts(house: House, kind: str) -> None:
+def test_a_stream_of_each_kind_counts(world: World, kind: str) -> None:
     """It is refused with 429 while another one is open, and opens when that one has ended."""
     if kind in STREAMS:
         address, accept = STREAMS[kind]
 
         def tried() -> Any:
-            return house.status(address, accept)
+            return world.status(address, accept)
 
         refused, opened = 429, 200
     else:
 
         def tried() -> Any:
-            return house.handshake(WEBSOCKETS[kind])
+            return world.handshake(WEBSOCKETS[kind])
 
         refused, opened = "429", "open"
     other = STREAMS["events" if kind == "robots" else "robots"]
-    # A stream ends a moment after its client has left.
+    # A stream ends shortly after its client has left.
     wait_for("it opens", lambda: tried() == opened)
-    with first_opened(house, *other):
+    with first_opened(world, *other):
         assert tried() == refused
     wait_for("it opens again", lambda: tried() == opened)
 
 
 @contextmanager
-def first_opened(house: House, address: str, accept: str) -> Iterator[None]:
-    """The only stream there is."""
+def first_opened(world: World, address: str, accept: str) -> Iterator[None]:
+    """The only open stream."""
     with ExitStack() as stack:
 
         def opens() -> bool:
-            answer = stack.enter_context(house.opened(address, accept))
+            answer = stack.enter_context(world.opened(address, accept))
             return answer.status_code == 200
 
         wait_for("the stream before has ended", opens)

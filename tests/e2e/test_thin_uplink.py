@@ -1,4 +1,4 @@
-"""A thin uplink between a robot and the relay: small topics pass beside what is too much for it. A real ROS 2 graph."""
+"""A slow uplink between a robot and the relay: small topics pass beside too much data, in a real ROS 2 graph."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_waiting import PATIENCE, wait_for
 from websockets.sync.client import connect
 
-sys.path.insert(0, str(Path(__file__).parents[2]))  # the package ``bench`` stands beside the tests
+from tests.worlds.waiting import PATIENCE, wait_for
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # the package ``bench`` is beside the tests
 
 from bench.robot import real_robot
 
@@ -29,7 +30,7 @@ MARK = re.compile(r"#\d+@(\d+)")
 
 @pytest.mark.parametrize("rate", [300_000, 100_000])
 def test_a_heavy_topic_does_not_make_the_small_ones_of_a_robot_late(rate: int) -> None:
-    """A small sample waits for one part of a large one, not for what the network would take."""
+    """A small sample waits for one part of a large one, not for the network's buffers."""
     with real_robot(STREAMS) as robot:
         token = robot.viewer("ann")
         headers = {"Authorization": f"Bearer {token}"}
@@ -55,12 +56,12 @@ def test_a_heavy_topic_does_not_make_the_small_ones_of_a_robot_late(rate: int) -
 
             reading = threading.Thread(target=read, daemon=True)
             reading.start()
-            # With its type a topic that the relay does not see yet is waited for.
+            # With a type, an unknown topic is awaited.
             for topic, type_name in ((SMALL, "std_msgs/msg/String"), (CLOUD, "sensor_msgs/msg/PointCloud2")):
                 socket.send(json.dumps({"op": "subscribe", "topic": topic, "type": type_name}))
             wait_for("both topics come", lambda: ages and clouds)
             robot.proxy.squeeze(rate * 8)
-            time.sleep(3)  # what had left before has to pass
+            time.sleep(3)  # earlier samples have to pass
             ages.clear()
             clouds.clear()
             wait_for("so much has come", lambda: len(ages) >= 200 and len(clouds) >= 4, 60)

@@ -1,9 +1,10 @@
-"""TLS of a real relay: who is trusted, what is refused in words, and certificates swapped while all goes on."""
+"""TLS of a real relay: trust, refusals with reasons, and certificates replaced during operation."""
 
 from __future__ import annotations
 
 import datetime
 import ipaddress
+import shutil
 import signal
 import socket
 import ssl
@@ -18,22 +19,24 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from switchboard_client import Client
-from switchboard_http import ask
-from switchboard_processes import BIN
-from switchboard_relay import Relay
-from switchboard_robot import Robot
-from switchboard_threads import Driver
-from switchboard_waiting import PATIENCE, wait_for
 from websockets.sync.client import connect
 
 from relay_server import PORTAL
+from tests.worlds.client_threads import Driver
+from tests.worlds.doc_examples import examples
+from tests.worlds.doc_scene import ROOT
+from tests.worlds.http_requests import ask
+from tests.worlds.processes import BIN
+from tests.worlds.relay_process import Relay
+from tests.worlds.robot_process import Robot
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import PATIENCE, wait_for
 
 DAY = datetime.timedelta(days=1)
 
 
 class Authority:
-    """A CA of the test's own, with its certificate in a file."""
+    """The test's own CA, with its certificate in a file."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self._key = ec.generate_private_key(ec.SECP256R1())
@@ -52,10 +55,10 @@ class Authority:
         return builder.add_extension(extension, critical=False).sign(self._key, hashes.SHA256())
 
     def certify(self, cert: Path, key: Path, *, host: bool = True, good: datetime.timedelta = DAY) -> int:
-        """Write a server's certificate and key; returns its serial number.
+        """Writes a server's certificate and key; returns its serial number.
 
-        :param host: for 127.0.0.1, else only for ``elsewhere.example``
-        :param good: how long from now on; negative when it has expired
+        :param host: for 127.0.0.1, otherwise only for ``elsewhere.example``
+        :param good: seconds of validity from now on; negative for an expired one
         """
         private = ec.generate_private_key(ec.SECP256R1())
         names: list[x509.GeneralName] = [x509.DNSName("elsewhere.example")]
@@ -74,7 +77,7 @@ class Authority:
         return own.serial_number
 
 
-class House:
+class World:
     """A relay that speaks TLS, a robot that trusts its CA, a driver."""
 
     def __init__(self, folder: Path) -> None:
@@ -90,7 +93,7 @@ class House:
 
     @property
     def context(self) -> ssl.SSLContext:
-        """What a client that trusts the CA uses."""
+        """The context of a client that trusts the CA."""
         return ssl.create_default_context(cafile=str(self.authority.path))
 
     def client(self) -> Client:
@@ -100,14 +103,14 @@ class House:
         return Client(connect(url, ssl=self.context, additional_headers=headers, open_timeout=PATIENCE))
 
     def reload(self, words: str) -> None:
-        """SIGHUP, until the log has these words once more."""
+        """Sends SIGHUP until the log has these words once more."""
         assert self.relay.process is not None
         before = self.relay.log.count(words)
         self.relay.process.signal(signal.SIGHUP)
         wait_for(f"the log says '{words}'", lambda: self.relay.log.count(words) > before)
 
     def serial(self, port: int) -> int:
-        """Serial number of the certificate a new connection is shown."""
+        """The serial number of the certificate for a new connection."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE
@@ -120,35 +123,34 @@ class House:
             return x509.load_der_x509_certificate(shown).serial_number
 
     def stop(self) -> None:
-        """End everything."""
         self.robot.stop()
         self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """One house for all; tests that swap the certificate swap a good one back."""
-    house = House(tmp_path_factory.mktemp("tls"))
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """One world for all; tests that replace the certificate restore it."""
+    world = World(tmp_path_factory.mktemp("tls"))
     try:
-        yield house
+        yield world
     finally:
-        house.stop()
+        world.stop()
 
 
 READ_AGAIN = "the TLS certificate was read again"
 
 
 @pytest.fixture
-def swapped(house: House) -> Iterator[None]:
-    """Puts a good certificate back."""
+def swapped(world: World) -> Iterator[None]:
+    """Restores a valid certificate."""
     yield
-    house.authority.certify(house.cert, house.key)
-    house.reload(READ_AGAIN)
+    world.authority.certify(world.cert, world.key)
+    world.reload(READ_AGAIN)
 
 
-def enroll(house: House, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """Try to enroll a robot over TLS; what ``switchboard-robot enroll`` says."""
-    command = [str(BIN / "switchboard-robot"), "enroll", "--relay", f"127.0.0.1:{house.relay.robots_port}"]
+def enroll(world: World, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Tries to enrol a robot over TLS; returns the output of ``switchboard-robot enroll``."""
+    command = [str(BIN / "switchboard-robot"), "enroll", "--relay", f"127.0.0.1:{world.relay.robots_port}"]
     command += ["--robot", "newcomer", "--code", "-", "--state", str(folder / "state"), "--tls", *options]
     return subprocess.run(
         command, input="AAAA-BBBB-CCCC-DDDD", capture_output=True, text=True, timeout=60, check=False
@@ -156,36 +158,36 @@ def enroll(house: House, folder: Path, *options: str) -> subprocess.CompletedPro
 
 
 def refused(done: subprocess.CompletedProcess[str], words: str) -> None:
-    """It failed for this reason, in a sentence."""
+    """It failed for this reason, in one line."""
     assert done.returncode != 0
     assert words in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_pages_and_websockets_come_over_tls(house: House) -> None:
-    """With the CA, https and wss work, say HSTS, and set cookies that never go over plain HTTP."""
-    port = house.relay.http_port
-    answer = ask(port, "GET", "/healthz", tls=house.context)
+def test_pages_and_websockets_come_over_tls(world: World) -> None:
+    """With the CA, https and wss work, send HSTS, and set cookies that are never sent over plain HTTP."""
+    port = world.relay.http_port
+    answer = ask(port, "GET", "/healthz", tls=world.context)
     assert answer.json == {"status": "ok"}
     assert "max-age=" in answer.headers["Strict-Transport-Security"]
     body = {"user": "driver", "password": "correct horse"}
     origin = {"Origin": f"https://127.0.0.1:{port}"}
-    login = ask(port, "POST", "/api/v1/session", body, headers=origin, tls=house.context)
+    login = ask(port, "POST", "/api/v1/session", body, headers=origin, tls=world.context)
     assert login.status == 200
     assert "secure" in login.headers["Set-Cookie"].lower()
-    with house.client() as client:
+    with world.client() as client:
         assert client.call("/relay/ping", {"robot": True})["result"]
 
 
-def test_pipelined_requests_are_answered_in_order_over_tls(house: House) -> None:
-    """Answers of many pieces, taken slowly, arrive whole."""
+def test_pipelined_requests_are_answered_in_order_over_tls(world: World) -> None:
+    """Answers of many pieces, read slowly, arrive whole."""
     assets = Path(PORTAL) / "assets"
     file = max(assets.iterdir(), key=lambda each: each.stat().st_size)
     request = f"GET /assets/{file.name} HTTP/1.1\r\nHost: x\r\n"
     received = b""
     with (
-        socket.create_connection(("127.0.0.1", house.relay.http_port), timeout=PATIENCE) as plain,
-        house.context.wrap_socket(plain, server_hostname="127.0.0.1") as secure,
+        socket.create_connection(("127.0.0.1", world.relay.http_port), timeout=PATIENCE) as plain,
+        world.context.wrap_socket(plain, server_hostname="127.0.0.1") as secure,
     ):
         secure.sendall((f"{request}\r\n" * 3 + f"{request}Connection: close\r\n\r\n").encode())
         while data := secure.recv(5000):
@@ -193,57 +195,79 @@ def test_pipelined_requests_are_answered_in_order_over_tls(house: House) -> None
     assert received.count(file.read_bytes()) == 4
 
 
-def test_who_does_not_trust_the_ca_does_not_connect(house: House) -> None:
-    """The relay's certificate is of its own CA, so the system's store is not enough."""
+def test_robot_that_does_not_trust_the_ca_does_not_connect(world: World) -> None:
+    """The relay's certificate is of its own CA, which the system's store does not have."""
     with pytest.raises(ssl.SSLCertVerificationError):
-        ask(house.relay.http_port, "GET", "/healthz", tls=ssl.create_default_context())
+        ask(world.relay.http_port, "GET", "/healthz", tls=ssl.create_default_context())
 
 
-def test_a_robot_is_driven_over_tls(house: House) -> None:
-    """Enrolled with --ca, the robot runs over TLS: control link, channel link and all."""
-    driver = Driver(house.client())
+def test_a_robot_is_driven_over_tls(world: World) -> None:
+    """Enrolled with --ca, the robot uses TLS for its control link and its channel link."""
+    driver = Driver(world.client())
     driver.start()
     try:
-        wait_for("the robot moves", house.robot.moving)
+        wait_for("the robot moves", world.robot.moving)
     finally:
         driver.stop()
-    wait_for("the robot stands", lambda: not house.robot.moving())
+    wait_for("the robot stands", lambda: not world.robot.moving())
 
 
-def test_a_robot_refuses_a_ca_it_was_not_given(house: House, tmp_path: Path) -> None:
-    """A relay of a foreign CA is refused in words, and the code is not told to it."""
+def test_a_robot_refuses_a_ca_it_was_not_given(world: World, tmp_path: Path) -> None:
+    """A relay of a foreign CA is refused with a reason, and does not receive the code."""
     refused(
-        enroll(house, tmp_path, "--ca", str(house.foreign.path)), "of nobody this robot trusts; give its CA"
+        enroll(world, tmp_path, "--ca", str(world.foreign.path)),
+        "not issued by an authority this robot trusts; give its CA",
     )
 
 
-def test_a_robot_refuses_a_certificate_for_another_name(house: House, tmp_path: Path) -> None:
-    """The name in the certificate must be the one that was dialled or asked for."""
-    trust = ("--ca", str(house.authority.path))
-    refused(enroll(house, tmp_path, *trust, "--server-name", "other.example"), "for another name")
-    # The right name gets as far as the code.
-    refused(enroll(house, tmp_path, *trust, "--server-name", "elsewhere.example"), "code is wrong")
+def test_a_robot_refuses_a_certificate_for_another_name(world: World, tmp_path: Path) -> None:
+    """The certificate must have the dialled or given name."""
+    trust = ("--ca", str(world.authority.path))
+    refused(enroll(world, tmp_path, *trust, "--server-name", "other.example"), "for another name")
+    # With the right name, only the code is refused.
+    refused(enroll(world, tmp_path, *trust, "--server-name", "elsewhere.example"), "code is wrong")
 
 
 @pytest.mark.usefixtures("swapped")
-def test_a_robot_refuses_a_certificate_for_another_address(house: House, tmp_path: Path) -> None:
-    """A certificate that does not name the address dialled is refused in words."""
-    house.authority.certify(house.cert, house.key, host=False)
-    house.reload(READ_AGAIN)
-    refused(enroll(house, tmp_path, "--ca", str(house.authority.path)), "for another name")
+def test_a_robot_refuses_a_certificate_for_another_address(world: World, tmp_path: Path) -> None:
+    """A certificate without the dialled address is refused with a reason."""
+    world.authority.certify(world.cert, world.key, host=False)
+    world.reload(READ_AGAIN)
+    refused(enroll(world, tmp_path, "--ca", str(world.authority.path)), "for another name")
 
 
 @pytest.mark.usefixtures("swapped")
-def test_a_robot_refuses_an_expired_certificate(house: House, tmp_path: Path) -> None:
-    """An expired certificate is refused in words that say what to do."""
-    house.authority.certify(house.cert, house.key, good=-DAY)
-    house.reload(READ_AGAIN)
-    refused(enroll(house, tmp_path, "--ca", str(house.authority.path)), "expired; it must be renewed")
+def test_a_robot_refuses_an_expired_certificate(world: World, tmp_path: Path) -> None:
+    """The error says what to do."""
+    world.authority.certify(world.cert, world.key, good=-DAY)
+    world.reload(READ_AGAIN)
+    refused(enroll(world, tmp_path, "--ca", str(world.authority.path)), "expired; renew it on the relay")
+
+
+@pytest.mark.usefixtures("swapped")
+def test_a_robot_trusts_the_documented_authority(world: World, tmp_path: Path) -> None:
+    """The commands of docs/operate/tls.md make files by which relay and robot connect."""
+    for line in examples(ROOT / "docs/operate/tls.md"):
+        if line.text.startswith("openssl "):
+            subprocess.run(
+                ["bash", "-c", line.text], cwd=tmp_path, check=True, capture_output=True, timeout=60
+            )
+    shutil.copy(tmp_path / "chain.pem", world.cert)
+    shutil.copy(tmp_path / "key.pem", world.key)
+    world.reload(READ_AGAIN)
+    trust = ("--ca", str(tmp_path / "ca.pem"), "--server-name", "robots.example.org")
+    refused(enroll(world, tmp_path, *trust), "code is wrong")
+    context = ssl.create_default_context(cafile=str(tmp_path / "ca.pem"))
+    with (
+        socket.create_connection(("127.0.0.1", world.relay.http_port), timeout=10) as plain,
+        context.wrap_socket(plain, server_hostname="robots.example.org") as secure,
+    ):
+        assert secure.getpeercert()
 
 
 @pytest.mark.parametrize("listener", ["http_port", "robots_port"])
-def test_tls_1_1_is_refused(house: House, listener: str) -> None:
-    """A client that speaks nothing newer gets the alert for its version; 1.2 is taken."""
+def test_tls_1_1_is_refused(world: World, listener: str) -> None:
+    """An older client gets the alert for its version; 1.2 is accepted."""
 
     def shake(version: ssl.TLSVersion) -> str:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -252,7 +276,7 @@ def test_tls_1_1_is_refused(house: House, listener: str) -> None:
         context.set_ciphers("ALL:@SECLEVEL=0")
         context.minimum_version = context.maximum_version = version
         with (
-            socket.create_connection(("127.0.0.1", getattr(house.relay, listener)), timeout=10) as plain,
+            socket.create_connection(("127.0.0.1", getattr(world.relay, listener)), timeout=10) as plain,
             context.wrap_socket(plain) as secure,
         ):
             return str(secure.version())
@@ -263,43 +287,43 @@ def test_tls_1_1_is_refused(house: House, listener: str) -> None:
     assert shake(ssl.TLSVersion.TLSv1_2) == "TLSv1.2"
 
 
-def test_sighup_swaps_the_certificate_and_drops_nothing(house: House) -> None:
-    """New connections see the new certificate; the robot and the client that are there stay as they are."""
-    ports = (house.relay.http_port, house.relay.robots_port)
-    with house.client() as client:
+def test_sighup_swaps_the_certificate_and_drops_nothing(world: World) -> None:
+    """New connections get the new certificate; existing connections of robot and client stay."""
+    ports = (world.relay.http_port, world.relay.robots_port)
+    with world.client() as client:
         client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
         client.until(op="publish")
-        offline = house.relay.log.count("is offline")
-        new = house.authority.certify(house.cert, house.key)
-        assert all(house.serial(port) != new for port in ports)
-        house.reload(READ_AGAIN)
-        assert all(house.serial(port) == new for port in ports)
+        offline = world.relay.log.count("is offline")
+        new = world.authority.certify(world.cert, world.key)
+        assert all(world.serial(port) != new for port in ports)
+        world.reload(READ_AGAIN)
+        assert all(world.serial(port) == new for port in ports)
         assert client.call("/relay/ping", {"robot": True})["result"]
         client.until(op="publish", topic="/odom")
-        with house.client() as other:
+        with world.client() as other:
             assert other.call("/relay/ping")["result"]
-        assert house.relay.log.count("is offline") == offline
+        assert world.relay.log.count("is offline") == offline
 
 
-def test_a_certificate_that_can_not_be_used_changes_nothing(house: House) -> None:
-    """SIGHUP with a broken file is told in the log, and the old certificate stays in use."""
-    old = house.serial(house.relay.http_port)
-    good = house.cert.read_bytes()
-    house.cert.write_text("no certificate")
+def test_a_certificate_that_can_not_be_used_changes_nothing(world: World) -> None:
+    """After SIGHUP with a broken file the log has an error, and the old certificate stays in use."""
+    old = world.serial(world.relay.http_port)
+    good = world.cert.read_bytes()
+    world.cert.write_text("no certificate")
     try:
-        house.reload("the old certificate stays in use")
-        assert house.serial(house.relay.http_port) == old
+        world.reload("the old certificate stays in use")
+        assert world.serial(world.relay.http_port) == old
     finally:
-        house.cert.write_bytes(good)
-    assert ask(house.relay.http_port, "GET", "/healthz", tls=house.context).status == 200
+        world.cert.write_bytes(good)
+    assert ask(world.relay.http_port, "GET", "/healthz", tls=world.context).status == 200
 
 
-def test_who_speaks_no_tls_is_cut_and_disturbs_nobody(house: House) -> None:
-    """Plain HTTP, plain frames and silence end by themselves; the relay has no trouble with them."""
-    since = len(house.relay.log)
+def test_client_without_tls_is_cut_and_disturbs_no_other(world: World) -> None:
+    """Plain HTTP, plain frames and silence end by themselves without effect on the relay."""
+    since = len(world.relay.log)
     begun = time.monotonic()
     opened = []
-    for port in (house.relay.http_port, house.relay.robots_port):
+    for port in (world.relay.http_port, world.relay.robots_port):
         for first in (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", b"\x00\x00\x00\x02\x00{", b""):
             plain = socket.create_connection(("127.0.0.1", port), timeout=30)
             plain.sendall(first)
@@ -312,6 +336,6 @@ def test_who_speaks_no_tls_is_cut_and_disturbs_nobody(house: House) -> None:
             pass
         plain.close()
     assert time.monotonic() - begun < 25
-    with house.client() as client:
+    with world.client() as client:
         assert client.call("/relay/ping", {"robot": True})["result"]
-    assert "Traceback" not in house.relay.log[since:]
+    assert "Traceback" not in world.relay.log[since:]

@@ -1,4 +1,4 @@
-"""Topics that do not exist yet, and publishers that come back otherwise, in a real graph."""
+"""Topics that do not exist yet, and publishers that return with changes, in a real graph."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_client import Client
-from switchboard_processes import Process, ros_environment
-from switchboard_waiting import wait_for
+
+from tests.worlds.processes import Process, ros_environment
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 TALKING = Path(__file__).parent / "clients" / "talking.py"
 STRING, BOOL = "std_msgs/msg/String", "std_msgs/msg/Bool"
@@ -23,7 +24,7 @@ Talking = Callable[..., AbstractContextManager[None]]
 
 @pytest.fixture
 def talking(world: Any, tmp_path: Path) -> Talking:
-    """Starts a node in the robot's graph that publishes."""
+    """Starts a publishing node in the robot's graph."""
     numbers = itertools.count()
 
     @contextmanager
@@ -42,7 +43,7 @@ def talking(world: Any, tmp_path: Path) -> Talking:
 
 @pytest.fixture
 def clients(world: Any) -> Iterator[list[Client]]:
-    """Three viewers who want to hear of errors."""
+    """Three viewers that receive errors."""
     found = [world.relay.connect("rover", world.viewer) for _ in range(3)]
     try:
         for client in found:
@@ -54,7 +55,7 @@ def clients(world: Any) -> Iterator[list[Client]]:
 
 
 def known(client: Client, topic: str, type_name: str) -> None:
-    """Wait until the relay has heard of a topic."""
+    """Waits until the relay knows a topic."""
 
     def has_it() -> bool:
         return bool(client.call("/rosapi/topic_type", {"topic": topic})["values"] == {"type": type_name})
@@ -62,8 +63,8 @@ def known(client: Client, topic: str, type_name: str) -> None:
     wait_for(f"{topic} is known", has_it)
 
 
-def test_who_was_right_about_a_topic_to_come(talking: Talking, clients: list[Client]) -> None:
-    """The first client's wrong guess keeps nobody from the topic, and is told to the first client."""
+def test_early_subscriber_with_the_right_type(talking: Talking, clients: list[Client]) -> None:
+    """The first client's wrong guess blocks no other client, and causes an error for the first."""
     wrong, right, again = clients
     wrong.send(op="subscribe", topic="/to_come", type=BOOL)
     right.send(op="subscribe", topic="/to_come", type=STRING)
@@ -82,7 +83,7 @@ def test_who_was_right_about_a_topic_to_come(talking: Talking, clients: list[Cli
 
 
 def test_publishers_that_come_back_with_another_type(talking: Talking, clients: list[Client]) -> None:
-    """Who left the type to the graph gets what there is, with the same subscription."""
+    """Clients without a type get the new messages on the same subscription."""
     careless, exact, _ = clients
     with talking("/changing", STRING):
         known(careless, "/changing", STRING)
@@ -96,7 +97,7 @@ def test_publishers_that_come_back_with_another_type(talking: Talking, clients: 
 
 
 def test_publishers_that_come_back_with_another_qos(talking: Talking, clients: list[Client]) -> None:
-    """A topic that is latched now is latched for late joiners too."""
+    """A topic that is latched now is latched for late subscribers too."""
     first, second, _ = clients
     with talking("/settling", STRING):
         known(first, "/settling", STRING)

@@ -1,4 +1,4 @@
-"""Cameras from the simulated robot to those who watch: real relay, daemon, camera process and sockets."""
+"""Cameras from the simulated robot to viewers: real relay, daemon, camera process and sockets."""
 
 from __future__ import annotations
 
@@ -17,25 +17,36 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from switchboard_browser import chromium
-from switchboard_http import ask
-from switchboard_relay import Relay
-from switchboard_video import CAMERA, Crowd, Eye, Mjpeg, decoded, get, known, path, streams
-from switchboard_waiting import PATIENCE, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from tests.worlds.browser import chromium
+from tests.worlds.http_requests import ask
+from tests.worlds.relay_process import Relay
+from tests.worlds.video_clients import (
+    CAMERA,
+    Mjpeg,
+    MjpegViewers,
+    VideoViewer,
+    decoded,
+    get,
+    known,
+    path,
+    streams,
+)
+from tests.worlds.waiting import PATIENCE, wait_for
+
 
 def url(relay: Relay, token: str, what: str, **parameters: Any) -> str:
-    """What a program that knows neither headers nor cookies is given."""
+    """A URL with a ticket, for programs without headers and cookies."""
     answer = ask(relay.http_port, "POST", "/api/v1/tickets", {"robot": "rover", "for": "video"}, token=token)
     return f"http://127.0.0.1:{relay.http_port}{path(what, **parameters, ticket=answer.json['ticket'])}"
 
 
 def unread(relay: Relay, token: str, **parameters: Any) -> socket.socket:
-    """A connection that has asked for the stream, whose reading is up to the test."""
+    """A connection that has requested the stream, which the test reads or not."""
     sock = socket.socket()
-    # Little may wait here, so that the relay sees at once that nothing is taken.
+    # A small buffer, so that the relay soon sees that the client does not read.
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     sock.settimeout(PATIENCE)
     sock.connect(("127.0.0.1", relay.http_port))
@@ -46,14 +57,14 @@ def unread(relay: Relay, token: str, **parameters: Any) -> socket.socket:
 
 @pytest.fixture(scope="module")
 def shown(world: Any) -> Any:
-    """The world, once the relay knows its camera, and the robot stands."""
+    """The world, once the relay knows its camera and the robot stands."""
     known(world.relay, world.viewer)
     world.left_alone()
     return world
 
 
 def test_a_snapshot_has_the_size_that_was_asked_for(shown: Any) -> None:
-    """JPEG or PNG, not kept by anybody, with the time it was taken."""
+    """JPEG or PNG, not cacheable, with its capture time."""
     for kind, start in (("mjpeg", b"\xff\xd8"), ("png", b"\x89PNG")):
         answer = get(shown.relay, shown.viewer, "snapshot", width=320, type=kind)
         assert answer.status == 200
@@ -64,8 +75,8 @@ def test_a_snapshot_has_the_size_that_was_asked_for(shown: Any) -> None:
         assert decoded(answer.body).shape == (240, 320, 3)
 
 
-def test_a_snapshot_of_a_slow_stream_is_the_picture_that_others_see(shown: Any) -> None:
-    """At one picture in twenty seconds nobody waits for the next; its time tells how old it is."""
+def test_a_snapshot_of_a_slow_stream_is_the_frame_that_others_see(shown: Any) -> None:
+    """At one frame per 20 s the request does not wait for the next; the frame's time shows its age."""
     with contextlib.closing(Mjpeg(shown.relay, shown.viewer, fps=0.05)) as viewer:
         part = viewer.part()
         assert part is not None
@@ -77,19 +88,19 @@ def test_a_snapshot_of_a_slow_stream_is_the_picture_that_others_see(shown: Any) 
 
 
 def test_edits_are_those_that_were_asked_for(shown: Any) -> None:
-    """The upper left corner of a turned picture is the lower right one of the other, for a robot that stands."""
+    """For a standing robot, the upper left corner of the rotated picture is the lower right one of the other."""
     whole, turned, cut = (
         decoded(get(shown.relay, shown.viewer, "snapshot", **edit).body).astype(int)
         for edit in ({}, {"invert": ""}, {"crop": "100,50,200,100"})
     )
     assert cut.shape == (100, 200, 3)
     assert np.abs(cut - whole[50:150, 100:300]).mean() < 6
-    # Not the line with the clock.
+    # Without the line with the clock.
     assert np.abs(turned[60:] - whole[::-1, ::-1][60:]).mean() < 6
 
 
 def test_the_stream_has_one_jpeg_a_part(shown: Any) -> None:
-    """Each as long as it says, each later than the one before, all of the size that was asked for."""
+    """Each has its stated length, a later time than the one before, and the requested size."""
     with contextlib.closing(Mjpeg(shown.relay, shown.viewer, width=320)) as viewer:
         assert viewer.answer.headers["Cache-Control"] == "no-store"
         parts = [viewer.part() for _ in range(10)]
@@ -104,7 +115,7 @@ def test_the_stream_has_one_jpeg_a_part(shown: Any) -> None:
 
 
 def opencv(address: str) -> Iterator[Any]:
-    """The pictures of an address as ffmpeg in OpenCV has them."""
+    """The frames of an address, read by OpenCV's ffmpeg."""
     capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG)
     try:
         assert capture.isOpened()
@@ -117,7 +128,7 @@ def opencv(address: str) -> Iterator[Any]:
 
 
 def pyav(address: str) -> Iterator[Any]:
-    """The same as ffmpeg in PyAV has them."""
+    """The frames of an address, read by PyAV's ffmpeg."""
     with av.open(address, timeout=PATIENCE) as container:
         assert container.format.name == "mpjpeg"
         for frame in container.decode(video=0):
@@ -126,7 +137,7 @@ def pyav(address: str) -> Iterator[Any]:
 
 @pytest.mark.parametrize("player", [opencv, pyav])
 def test_ffmpeg_reads_the_stream(shown: Any, player: Callable[[str], Iterator[Any]]) -> None:
-    """By a ticket in the address; what it shows is what a snapshot shows."""
+    """By a ticket in the address; its frames equal a snapshot."""
     with contextlib.closing(player(url(shown.relay, shown.viewer, "stream"))) as pictures:
         for picture in itertools.islice(pictures, 5):
             assert picture.shape == (480, 640, 3)
@@ -134,8 +145,15 @@ def test_ffmpeg_reads_the_stream(shown: Any, player: Callable[[str], Iterator[An
     assert np.abs(picture.astype(int) - whole).mean() < 6
 
 
+def test_the_camera_process_is_among_the_processes_of_the_robot(shown: Any) -> None:
+    with contextlib.closing(Mjpeg(shown.relay, shown.viewer, width=320)) as viewer:
+        assert viewer.part() is not None
+        rows = shown.relay.cli("top", "rover", "--every", "0.1")["processes"]
+    assert {"daemon", "guard", "camera"} <= {each["part"] for each in rows}
+
+
 def test_a_browser_shows_the_stream(shown: Any) -> None:
-    """An ``<img>`` on another site's page, by a ticket: its picture has the camera's size, and it moves."""
+    """An ``<img>`` on another site's page, by a ticket: it has the camera's size, and changes."""
     with chromium() as browser:
         page = browser.new_page()
         page.set_content(f'<img src="{url(shown.relay, shown.viewer, "stream")}">')
@@ -147,28 +165,28 @@ def test_a_browser_shows_the_stream(shown: Any) -> None:
 
 
 def test_the_websocket_waits_for_took(shown: Any) -> None:
-    """No second picture before the first was taken; then the newest."""
-    with Eye(shown.relay, shown.viewer) as eye:
-        first = eye.untaken()
+    """No second frame before the first is acknowledged; then the newest."""
+    with VideoViewer(shown.relay, shown.viewer) as watching_socket:
+        first = watching_socket.untaken()
         assert first.head["codec"] == "jpeg"
         assert decoded(first.body).shape == (first.head["height"], first.head["width"], 3) == (480, 640, 3)
         with pytest.raises(TimeoutError):
-            eye.untaken(1)
-        with Eye(shown.relay, shown.viewer) as other:
+            watching_socket.untaken(1)
+        with VideoViewer(shown.relay, shown.viewer) as other:
             later = other.watch_until(
                 "pictures go by", lambda each: each.head["stamp"] > first.head["stamp"] + 0.5, PATIENCE
             )
-        eye.took(first)
-        second = eye.picture()
+        watching_socket.took(first)
+        second = watching_socket.picture()
         assert second.head["number"] > first.head["number"]
         assert second.head["stamp"] >= later.head["stamp"]
 
 
 def test_h264_begins_with_a_key_frame_and_decodes(shown: Any) -> None:
-    """Also for who comes later; fewer bytes than JPEG of the same size."""
-    with Eye(shown.relay, shown.viewer, codec="h264") as early:
+    """For later viewers too; it needs fewer bytes than JPEG of the same size."""
+    with VideoViewer(shown.relay, shown.viewer, codec="h264") as early:
         early.picture()
-        with Eye(shown.relay, shown.viewer, codec="h264") as late:
+        with VideoViewer(shown.relay, shown.viewer, codec="h264") as late:
             pictures = [late.picture() for _ in range(20)]
     assert pictures[0].head["key"]
     assert {each.head["codec"] for each in pictures} == {"h264"}
@@ -177,16 +195,16 @@ def test_h264_begins_with_a_key_frame_and_decodes(shown: Any) -> None:
     frames += decoder.decode(None)
     assert len(frames) == len(pictures)
     assert {(frame.width, frame.height) for frame in frames} == {(640, 480)}
-    with Eye(shown.relay, shown.viewer) as eye:
-        jpeg = eye.picture()
+    with VideoViewer(shown.relay, shown.viewer) as watching_socket:
+        jpeg = watching_socket.picture()
     assert statistics.median(len(each.body) for each in pictures) < len(jpeg.body)
 
 
 def code_of(relay: Relay, token: str) -> int:
-    """How the websocket refuses somebody: the status of the handshake, or the close code."""
+    """The websocket's refusal: the status of the handshake, or the close code."""
     try:
-        with Eye(relay, token) as eye:
-            eye.untaken()
+        with VideoViewer(relay, token) as watching_socket:
+            watching_socket.untaken()
     except InvalidStatus as error:
         return error.response.status_code
     except ConnectionClosed as error:
@@ -195,8 +213,8 @@ def code_of(relay: Relay, token: str) -> int:
     raise AssertionError("a picture came")
 
 
-def test_who_may_not_view_gets_no_picture(shown: Any) -> None:
-    """Nobody: 401; a stranger, or a camera that is denied: 404 as if it were not there; 403 in a handshake."""
+def test_frames_need_the_right_to_view(shown: Any) -> None:
+    """Unauthenticated: 401; no right, or a denied camera: 404 as for a missing one; 403 in a handshake."""
     shown.relay.user("blinkered")
     shown.relay.cli("right", "grant", "blinkered", "rover", "viewer", "--deny", "view:/camera/**")
     blinkered = shown.relay.token("blinkered")
@@ -208,7 +226,7 @@ def test_who_may_not_view_gets_no_picture(shown: Any) -> None:
 
 
 def test_a_revoked_right_ends_what_runs(shown: Any) -> None:
-    """Stream and websocket alike, and nothing is to be had any more."""
+    """Streams and websockets end, and new requests fail."""
     shown.relay.user("invited")
     invited = shown.relay.token("invited")
     shown.relay.cli("right", "grant", "invited", "rover", "viewer")
@@ -220,20 +238,20 @@ def test_a_revoked_right_ends_what_runs(shown: Any) -> None:
 
     with (
         contextlib.closing(Mjpeg(shown.relay, invited)) as viewer,
-        Eye(shown.relay, invited) as eye,
+        VideoViewer(shown.relay, invited) as watching_socket,
         ThreadPoolExecutor(2) as pool,
     ):
         assert viewer.part() is not None
-        eye.picture()
-        ends = [pool.submit(watch_to_the_end, each) for each in (viewer.part, eye.picture)]
+        watching_socket.picture()
+        ends = [pool.submit(watch_to_the_end, each) for each in (viewer.part, watching_socket.picture)]
         shown.relay.cli("right", "revoke", "invited", "rover")
         for each in ends:
             each.result(PATIENCE)
     assert get(shown.relay, invited, "stream").status == 404
 
 
-def test_pictures_are_not_to_be_had_by_subscribing_to_them(shown: Any) -> None:
-    """Who may not view a camera gets its topic no more, once it is denied; another topic goes on."""
+def test_frames_are_not_to_be_had_by_subscribing_to_them(shown: Any) -> None:
+    """A denied camera ends its topic for the client; another topic continues."""
     shown.relay.user("listener")
     shown.relay.cli("right", "grant", "listener", "rover", "viewer")
     pictures = f"{CAMERA}/compressed"
@@ -243,16 +261,16 @@ def test_pictures_are_not_to_be_had_by_subscribing_to_them(shown: Any) -> None:
         client.send(op="subscribe", topic=pictures, throttle_rate=200)
         client.until(op="publish", topic=pictures)
         shown.relay.cli("right", "grant", "listener", "rover", "viewer", "--deny", "view:/camera/*")
-        told = client.until(op="status")["msg"]
-        assert told.startswith(f"unsubscribed from {pictures}: view on {pictures} is denied")
+        reported = client.until(op="status")["msg"]
+        assert reported.startswith(f"unsubscribed from {pictures}: view on {pictures} is denied")
         client.until(op="publish", topic="/odom")
         client.send(op="subscribe", topic=pictures)
         assert client.until(op="status")["msg"].startswith(f"view on {pictures} is denied")
         assert pictures not in client.call("/rosapi/topics")["values"]["topics"]
 
 
-def test_a_ticket_for_pictures_is_no_way_to_drive(shown: Any) -> None:
-    """Nor does one for the websocket show any."""
+def test_a_ticket_for_frames_does_not_allow_driving(shown: Any) -> None:
+    """Nor does a ticket for the websocket show any."""
     with pytest.raises(InvalidStatus, match="401"):
         connect(f"{shown.relay.url('rover')}?{url(shown.relay, shown.operator, 'stream').partition('?')[2]}")
     wide = ask(shown.relay.http_port, "POST", "/api/v1/tickets", {"robot": "rover"}, token=shown.operator)
@@ -260,31 +278,33 @@ def test_a_ticket_for_pictures_is_no_way_to_drive(shown: Any) -> None:
     assert ask(shown.relay.http_port, "GET", address).status == 401
 
 
-def test_who_watches_is_at_the_robot(shown: Any) -> None:
-    """By name, as long as he does."""
+def test_viewer_is_a_user_of_the_robot(shown: Any) -> None:
+    """By name, as long as the viewer stays."""
 
     def who() -> list[dict[str, Any]]:
         (robot,) = [each for each in shown.relay.cli("status")["robots"] if each["name"] == "rover"]
-        return [each for each in robot["onlookers"] if each["user"] == "onlooker"]
+        return [each for each in robot["viewers"] if each["user"] == "onlooker"]
 
     shown.relay.user("onlooker")
     shown.relay.cli("right", "grant", "onlooker", "rover", "viewer")
-    with Eye(shown.relay, shown.relay.token("onlooker")) as eye:
-        eye.picture()
+    with VideoViewer(shown.relay, shown.relay.token("onlooker")) as watching_socket:
+        watching_socket.picture()
         assert [each["camera"] for each in who()] == [CAMERA]
         assert shown.relay.state_of("rover") == "in_use"
     wait_for("nobody watches", lambda: not who())
 
 
 def test_slow_viewers_are_nothing_to_fast_ones(shown: Any) -> None:
-    """One that stops reading is cut, one at 20 KB/s stays; ten others have as many pictures as without them."""
+    """A viewer that stops reading is cut, one at 20 KB/s stays; ten others get as many frames as without
+    them.
+    """
     relay, token = shown.relay, shown.viewer
 
     def watching(count: int) -> bool:
         return sum(each["viewers"] for each in streams(relay, token)) == count
 
     with contextlib.ExitStack() as stack:
-        fast = stack.enter_context(Crowd(relay, token, 10, quality=50))
+        fast = stack.enter_context(MjpegViewers(relay, token, 10, quality=50))
         wait_for("each has a picture", lambda: all(each.seen for each in fast.viewers))
         alone = statistics.median(fast.rates(3))
         stopped, slow = (stack.enter_context(unread(relay, token, quality=50)) for _ in range(2))
@@ -298,7 +318,7 @@ def test_slow_viewers_are_nothing_to_fast_ones(shown: Any) -> None:
         sipping = stack.enter_context(ThreadPoolExecutor(1)).submit(sip)
         stack.callback(enough.set)
         wait_for("both watch", lambda: watching(12))
-        # A computer full of tests loses a second at times; who is held up by others never has as many.
+        # A busy machine may lose a second; a delayed viewer would have far fewer.
         wait_for("the fast ones have as many as without them", lambda: min(fast.rates(3)) > 0.8 * alone)
         wait_for("the stopped one is cut", lambda: watching(11))
         wait_for("they still have", lambda: min(fast.rates(2)) > 0.8 * alone)

@@ -1,4 +1,6 @@
-"""Spoken words move a robot: eSpeak NG speaks, the program hears, the relay, the daemon and the simulator obey."""
+"""Spoken words move a robot: eSpeak NG speaks, the program recognises, and relay, daemon and simulator
+execute.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from switchboard_client import Client
-from switchboard_fed import Fed
-from switchboard_processes import Process, running
-from switchboard_speech import RATE, Mouth, spaced, speech
-from switchboard_waiting import wait_for
+
+from tests.worlds.piped_process import PipedProcess
+from tests.worlds.processes import Process, running
+from tests.worlds.speech import RATE, SimulatedMicrophone, spaced, speech
+from tests.worlds.sync_client import Client
+from tests.worlds.waiting import wait_for
 
 SECONDS = "0.6"
 """How long a word acts here."""
@@ -24,8 +27,8 @@ ABSENCE = 0.7
 """Seconds that prove an absence: a word is obeyed after half of that."""
 
 
-class Hall:
-    """A robot that hears."""
+class VoiceWorld:
+    """A robot with voice control."""
 
     def __init__(self, folder: Path, world: Any) -> None:
         self.folder = folder
@@ -37,28 +40,30 @@ class Hall:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Of the program."""
+        """The environment of the program."""
         return {**os.environ, "SWITCHBOARD_TOKEN": self.token}
 
     def command(self, *options: str) -> list[str]:
-        """The program."""
+        """The command line of the program."""
         module = [sys.executable, "-u", "-m", "robot_client.apps.voice", self.relay.url("rover")]
         return [*module, "--seconds", SECONDS, *options]
 
-    def listening(self) -> tuple[Fed, Mouth]:
-        """The program, and who speaks to it by its standard input."""
+    def listening(self) -> tuple[PipedProcess, SimulatedMicrophone]:
+        """The program, with speech on its standard input."""
         self._runs += 1
-        voice = Fed(self.command("--pcm"), self.folder / "voice", f"voice{self._runs}", self.environment)
+        voice = PipedProcess(
+            self.command("--pcm"), self.folder / "voice", f"voice{self._runs}", self.environment
+        )
         voice.wait_to_say("listening")
-        return voice, Mouth(os.dup(voice.feed))
+        return voice, SimulatedMicrophone(os.dup(voice.feed))
 
     def moved(self, since: int, ahead: float, left: float) -> bool:
-        """Whether a command of these directions was carried out."""
+        """Whether a command with these directions was executed."""
         commands = self.robot.events("command", since)
         return any(np.sign(each["v"]) == ahead and np.sign(each["w"]) == left for each in commands)
 
     def stands(self) -> None:
-        """Wait until the robot stands, by a zero that was said."""
+        """Waits until the robot stands after a zero command."""
 
         def stands() -> bool:
             last = self.robot.events("command")[-1]
@@ -68,55 +73,55 @@ class Hall:
 
 
 @pytest.fixture(scope="module")
-def hall(tmp_path_factory: pytest.TempPathFactory, world: Any) -> Hall:
-    """One for all."""
-    return Hall(tmp_path_factory.mktemp("hall"), world)
+def scene(tmp_path_factory: pytest.TempPathFactory, world: Any) -> VoiceWorld:
+    """One for all tests."""
+    return VoiceWorld(tmp_path_factory.mktemp("scene"), world)
 
 
-def test_words_move_the_robot_and_noise_does_not(hall: Hall) -> None:
-    """For a moment; *stop* is the relay's as long as nobody had to take control."""
-    hall.world.left_alone()
-    voice, mouth = hall.listening()
-    with hall.relay.connect("rover", hall.token) as client, running(voice, mouth):
-        mouth.start()
-        mouth.say(speech("purple elephant"))
-        mouth.say(np.random.default_rng(1).normal(0, 6000, RATE // 2).astype(np.int16))
+def test_words_move_the_robot_and_noise_does_not(scene: VoiceWorld) -> None:
+    """For a short time; *stop* is the relay's stop while the program has not needed control."""
+    scene.world.left_alone()
+    voice, microphone = scene.listening()
+    with scene.relay.connect("rover", scene.token) as client, running(voice, microphone):
+        microphone.start()
+        microphone.say(speech("purple elephant"))
+        microphone.say(np.random.default_rng(1).normal(0, 6000, RATE // 2).astype(np.int16))
         since = time.monotonic_ns()
-        time.sleep(ABSENCE)  # so long nothing must come
-        assert hall.robot.events("command", since) == []
-        mouth.say(speech("stop"))
+        time.sleep(ABSENCE)  # no command must arrive meanwhile
+        assert scene.robot.events("command", since) == []
+        microphone.say(speech("stop"))
         client.send(op="subscribe", topic="/relay/control")
-        told = wait_for("the robot is stopped", lambda: stopped(client))
-        assert told["holder"] is None
+        reported = wait_for("the robot is stopped", lambda: stopped(client))
+        assert reported["holder"] is None
         assert client.call("/relay/take_control")["values"]["success"]
         wait_for("it is resumed", lambda: client.call("/relay/resume")["result"])
         assert client.call("/relay/release_control")["values"]["success"]
-        since = mouth.say(speech("ahead"))
-        wait_for("it goes ahead", lambda: hall.moved(since, 1, 0))
-        hall.stands()
+        since = microphone.say(speech("ahead"))
+        wait_for("it goes ahead", lambda: scene.moved(since, 1, 0))
+        scene.stands()
         wait_for("it has control", lambda: client.until(op="publish")["msg"]["holder"])
         assert voice.stop() == 0
         wait_for("control is given back", lambda: client.until(op="publish")["msg"]["holder"] is None)
 
 
 def stopped(client: Client) -> Any:
-    """What is told next of control, if the robot is stopped by then."""
-    told = client.until(op="publish")["msg"]
-    return told if told["stopped"] else None
+    """The next control message, if the robot is stopped by then."""
+    reported = client.until(op="publish")["msg"]
+    return reported if reported["stopped"] else None
 
 
-def test_a_file_is_heard_to_its_end(hall: Hall) -> None:
-    """Then the program ends, when the last word has been done."""
-    path = hall.folder / "orders.wav"
+def test_a_file_is_recognised_to_its_end(scene: VoiceWorld) -> None:
+    """The program ends when the last word has been executed."""
+    path = scene.folder / "orders.wav"
     with wave.open(str(path), "wb") as file:
         file.setnchannels(1)
         file.setsampwidth(2)
         file.setframerate(RATE)
         file.writeframes(spaced(speech("right"), gap=0.5).tobytes())
     since = time.monotonic_ns()
-    voice = Process(hall.command("--wav", str(path)), hall.folder, "file", hall.environment)
+    voice = Process(scene.command("--wav", str(path)), scene.folder, "file", scene.environment)
     with running(voice):
         assert voice.popen.wait(60) == 0
-    assert hall.moved(since, 0, -1)
+    assert scene.moved(since, 0, -1)
     assert voice.said().splitlines()[-3:] == ["right", "stands", "ended"]
-    hall.stands()
+    scene.stands()

@@ -1,4 +1,4 @@
-"""The clock by which commands grow old."""
+"""The clock for the age of commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ASLEEP = 3_600_000_000_000
 
 
 def test_a_suspend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After an hour asleep, in which the monotonic clock stood still, an hour has passed."""
+    """After an hour of suspend, during which the monotonic clock stood still, an hour has passed."""
     before = time.monotonic_ns()
     monkeypatch.setattr(time, "CLOCK_BOOTTIME", 7, raising=False)
     slept = {7: ASLEEP}
@@ -23,7 +23,7 @@ def test_a_suspend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_without_such_a_clock_the_monotonic_one_serves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Systems that can't tell how long they slept have the monotonic clock."""
+    """Systems that cannot measure suspends have the monotonic clock."""
     monkeypatch.delattr(time, "CLOCK_BOOTTIME", raising=False)
     before = time.monotonic_ns()
     assert before <= now_ns() <= time.monotonic_ns()

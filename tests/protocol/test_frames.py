@@ -16,10 +16,10 @@ from relay_protocol.frames import (
     Frame,
     FrameDecoder,
     JsonFrame,
-    PictureJoiner,
-    PicturePart,
     SampleFrame,
     VideoFrame,
+    VideoFrameJoiner,
+    VideoFramePart,
 )
 
 U32 = st.integers(0, frames.MAX_U32)
@@ -30,7 +30,7 @@ FRAMES = st.one_of(
     st.builds(JsonFrame, BODIES),
     st.builds(SampleFrame, U32, U64, BODIES),
     st.builds(VideoFrame, U32, U64, BODIES),
-    st.builds(PicturePart, U32, U64, U32, U32, st.binary(min_size=1, max_size=60)),
+    st.builds(VideoFramePart, U32, U64, U32, U32, st.binary(min_size=1, max_size=60)),
 )
 
 
@@ -40,8 +40,8 @@ def encode(frame: Frame) -> bytes:
         return frames.encode_json(frame.body)
     if isinstance(frame, SampleFrame):
         return frames.encode_sample(frame.number, frame.stamp, frame.body)
-    if isinstance(frame, PicturePart):
-        return frames.encode_picture_part(frame.number, frame.stamp, frame.total, frame.offset, frame.body)
+    if isinstance(frame, VideoFramePart):
+        return frames.encode_video_part(frame.number, frame.stamp, frame.total, frame.offset, frame.body)
     return frames.encode_video(frame.number, frame.stamp, frame.body)
 
 
@@ -55,7 +55,7 @@ def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
 def test_frames_come_out_as_they_went_in_however_the_stream_is_cut(
     sent: list[Frame], cuts: list[int]
 ) -> None:
-    """Every frame survives, in order, whatever chunks the network makes."""
+    """Every frame survives, in order, for any division by the network."""
     data = b"".join(map(encode, sent))
     decoder = FrameDecoder(limit=1000)
     received = [frame for piece in pieces(data, cuts) for frame in decoder.feed(piece)]
@@ -65,7 +65,7 @@ def test_frames_come_out_as_they_went_in_however_the_stream_is_cut(
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 10_000), max_size=12))
 def test_junk_ends_the_same_way_however_it_is_cut(data: bytes, cuts: list[int]) -> None:
-    """Junk gives the same frames or the same error fed whole and in pieces, and never another exception."""
+    """Invalid bytes give the same frames or the same error whole and in pieces, and never another exception."""
 
     def outcome(parts: list[bytes]) -> str | None:
         decoder = FrameDecoder(limit=64)
@@ -80,7 +80,7 @@ def test_junk_ends_the_same_way_however_it_is_cut(data: bytes, cuts: list[int]) 
 
 
 def test_a_frame_that_trickles_in_costs_no_more_than_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What has come of it is looked at when it is whole, not with each byte."""
+    """Received bytes are not parsed again with each further byte."""
     read: list[int] = []
     real = frames._LENGTH
     monkeypatch.setattr(frames, "_LENGTH", lambda data, start: read.append(len(data)) or real(data, start))
@@ -92,20 +92,20 @@ def test_a_frame_that_trickles_in_costs_no_more_than_its_size(monkeypatch: pytes
 
 
 def test_a_huge_length_is_refused_before_its_body_comes() -> None:
-    """Four bytes that announce 4 GiB are enough to be refused, and nothing is held."""
+    """The four bytes of a length of 4 GiB are refused, and nothing is stored."""
     with pytest.raises(FrameTooLarge, match="4294967295 bytes was announced; at most 1000"):
         FrameDecoder(limit=1000).feed(b"\xff\xff\xff\xff")
 
 
 def test_a_frame_of_exactly_the_limit_passes() -> None:
-    """The limit counts kind and body."""
+    """The limit includes kind and body."""
     assert FrameDecoder(limit=10).feed(frames.encode_json(b"123456789")) == [JsonFrame(b"123456789")]
     with pytest.raises(FrameTooLarge):
         FrameDecoder(limit=10).feed(frames.encode_json(b"1234567890"))
 
 
 def test_the_limit_can_be_raised_between_frames() -> None:
-    """A peer that has proved itself may send more on the same connection."""
+    """A peer that has proved its key may send more on the same connection."""
     decoder = FrameDecoder(limit=10)
     decoder.limit = 100
     assert decoder.feed(frames.encode_json(b"x" * 50)) == [JsonFrame(b"x" * 50)]
@@ -122,15 +122,15 @@ def test_the_limit_can_be_raised_between_frames() -> None:
     ],
 )
 def test_malformed_frames_are_refused(data: bytes) -> None:
-    """No kind, an unknown kind, a sample or picture without number and stamp, and a part without a byte are faults of
-    the peer.
+    """No kind, an unknown kind, a sample or picture without number and stamp, and a part without a byte are
+    errors of the peer.
     """
     with pytest.raises(MalformedMessage):
         FrameDecoder(limit=1000).feed(data)
 
 
 def test_an_unfinished_frame_waits() -> None:
-    """Bytes of a frame that is not whole yet are held and counted."""
+    """Bytes of an incomplete frame are stored and counted."""
     decoder = FrameDecoder(limit=1000)
     assert decoder.feed(b"\0\0\0\x05\0ab") == []
     assert decoder.buffered == 7
@@ -158,7 +158,7 @@ def in_parts(number: int, stamp: int, body: bytes, size: int) -> list[bytes]:
 def test_parts_make_the_samples_they_came_from(
     sent: list[tuple[int, int, bytes]], size: int, random: Random, cuts: list[int]
 ) -> None:
-    """Samples in parts come out whole, whatever stands between their parts and however the stream is cut."""
+    """Samples in parts are joined, for any frames between their parts and any division of the stream."""
     waiting = [in_parts(*sample, size) for sample in sent]
     stream = b""
     while waiting:
@@ -173,7 +173,7 @@ def test_parts_make_the_samples_they_came_from(
 
 
 def test_parts_of_number_zero_make_a_message() -> None:
-    """No longer than one that comes whole, by the limit of frames."""
+    """They have the length limit of a whole frame."""
     decoder = FrameDecoder(limit=1000)
     decoder.sample_limit = 5000
     body = bytes(999)
@@ -184,7 +184,7 @@ def test_parts_of_number_zero_make_a_message() -> None:
 
 
 def test_memory_grows_with_what_came() -> None:
-    """A large sample that was announced takes no memory before its bytes are there."""
+    """An announced large sample takes no memory before its bytes arrive."""
     decoder = FrameDecoder(limit=2**24)
     tracemalloc.start()
     decoder.feed(frames.encode_part(1, 0, 2**23, 0, b"a"))
@@ -195,7 +195,7 @@ def test_memory_grows_with_what_came() -> None:
 
 
 def test_unfinished_samples_are_bounded_in_number_and_size() -> None:
-    """Many samples that are begun and never finished, and much of few, break the contract."""
+    """Many unfinished samples, or many bytes of a few, violate the contract."""
     decoder = FrameDecoder(limit=2**24)
     for number in range(frames.UNFINISHED):
         decoder.feed(frames.encode_part(number, 0, 9, 0, b"a"))
@@ -210,7 +210,7 @@ def test_unfinished_samples_are_bounded_in_number_and_size() -> None:
 
 
 def test_finished_samples_make_room() -> None:
-    """What is finished, or begun anew, counts no more."""
+    """Finished samples, and those that begin again, do not count."""
     decoder = FrameDecoder(limit=1000)
     for stamp in range(50):
         decoder.feed(frames.encode_part(1, stamp, 900, 0, bytes(800)))
@@ -222,14 +222,14 @@ def test_finished_samples_make_room() -> None:
 
 
 @given(st.lists(PARTED, max_size=6), st.integers(1, 70), st.data())
-def test_parts_make_the_pictures_they_came_from(
+def test_parts_make_the_images_they_came_from(
     sent: list[tuple[int, int, bytes]], size: int, data: st.DataObject
 ) -> None:
-    """A picture that breaks off is forgotten as soon as another begins; the others come out whole."""
-    joiner = PictureJoiner(limit=60)
+    """An interrupted picture is dropped when another begins; the others are complete."""
+    joiner = VideoFrameJoiner(limit=60)
     for number, stamp, body in sent:
         starts = range(0, len(body), size)
-        parts = [PicturePart(number, stamp, len(body), at, body[at : at + size]) for at in starts]
+        parts = [VideoFramePart(number, stamp, len(body), at, body[at : at + size]) for at in starts]
         kept = data.draw(st.integers(1, len(parts)))
         joined = [joiner.join(part) for part in parts[:kept]]
         assert joined[:-1] == [None] * (kept - 1)
@@ -241,39 +241,39 @@ def test_parts_make_the_pictures_they_came_from(
 @pytest.mark.parametrize(
     ("part", "error"),
     [
-        (PicturePart(1, 2, 9, 4, b"x"), "does not follow"),
-        (PicturePart(1, 2, 9, 2, b"x"), "does not follow"),
-        (PicturePart(1, 3, 9, 3, b"x"), "does not follow"),
-        (PicturePart(1, 2, 8, 3, b"x"), "does not follow"),
-        (PicturePart(2, 2, 9, 3, b"x"), "does not follow"),
-        (PicturePart(1, 2, 9, 3, bytes(7)), "longer than its 9 bytes"),
-        (PicturePart(2, 2, 0, 0, b"x"), "longer than its 0 bytes"),
-        (PicturePart(2, 2, 101, 0, b"x"), "at most 100 are taken"),
+        (VideoFramePart(1, 2, 9, 4, b"x"), "does not follow"),
+        (VideoFramePart(1, 2, 9, 2, b"x"), "does not follow"),
+        (VideoFramePart(1, 3, 9, 3, b"x"), "does not follow"),
+        (VideoFramePart(1, 2, 8, 3, b"x"), "does not follow"),
+        (VideoFramePart(2, 2, 9, 3, b"x"), "does not follow"),
+        (VideoFramePart(1, 2, 9, 3, bytes(7)), "longer than its 9 bytes"),
+        (VideoFramePart(2, 2, 0, 0, b"x"), "longer than its 0 bytes"),
+        (VideoFramePart(2, 2, 101, 0, b"x"), "at most 100 are taken"),
     ],
 )
-def test_parts_that_do_not_fit_are_refused(part: PicturePart, error: str) -> None:
-    """A gap, a repetition, another head, more than was announced, more than is taken."""
-    joiner = PictureJoiner(limit=100)
-    assert joiner.join(PicturePart(1, 2, 9, 0, b"abc")) is None
+def test_parts_that_do_not_fit_are_refused(part: VideoFramePart, error: str) -> None:
+    """A gap, a repetition, another head, more than announced, more than allowed."""
+    joiner = VideoFrameJoiner(limit=100)
+    assert joiner.join(VideoFramePart(1, 2, 9, 0, b"abc")) is None
     with pytest.raises(PeerError, match=error):
         joiner.join(part)
 
 
-def test_what_was_given_up_is_forgotten() -> None:
-    """Its next part follows nothing."""
-    joiner = PictureJoiner(limit=100)
-    joiner.join(PicturePart(1, 2, 9, 0, b"abc"))
+def test_abandoned_request_is_forgotten() -> None:
+    """Its next part has no beginning."""
+    joiner = VideoFrameJoiner(limit=100)
+    joiner.join(VideoFramePart(1, 2, 9, 0, b"abc"))
     joiner.drop()
     assert joiner.size == 0
     with pytest.raises(MalformedMessage, match="does not follow"):
-        joiner.join(PicturePart(1, 2, 9, 3, b"def"))
+        joiner.join(VideoFramePart(1, 2, 9, 3, b"def"))
 
 
-def test_a_picture_takes_memory_as_it_comes() -> None:
+def test_an_image_takes_memory_as_it_comes() -> None:
     """Not as it was announced."""
-    joiner = PictureJoiner(limit=2**24)
+    joiner = VideoFrameJoiner(limit=2**24)
     tracemalloc.start()
-    joiner.join(PicturePart(1, 0, 2**23, 0, b"a"))
+    joiner.join(VideoFramePart(1, 0, 2**23, 0, b"a"))
     used, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert used < 100_000

@@ -1,4 +1,4 @@
-"""What the robot imports of the protocol package."""
+"""The robot's imports of the protocol package."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PROTOCOL = Path(__file__).parents[2] / "protocol"
 
 
 def test_the_robot_needs_nothing_of_the_servers() -> None:
-    """All modules but the ROS types work without numpy, pybase64, cbor2 and rosbags."""
+    """All modules except the ROS types work without numpy, pybase64, cbor2 and rosbags."""
     program = f"""
 import importlib, sys
 sys.path.insert(0, {str(PROTOCOL)!r})

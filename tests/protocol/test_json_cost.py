@@ -1,4 +1,4 @@
-"""No message of a client holds up the others: what a large one costs, in time of the processor."""
+"""The CPU time of large client messages: none delays other clients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from relay_protocol import json_cost, limits, rosbridge
+from relay_protocol import json_cost, limits, nonfinite, rosbridge
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import KIB
 from relay_protocol.ros_types import TypeRegistry
@@ -29,24 +29,24 @@ def message_of(data: bytes) -> bytes:
 
 
 def listed(element: bytes) -> Callable[[int], bytes]:
-    """A list of the same again and again, of so many bytes."""
+    """A list of repeated items with this many bytes."""
     return lambda size: message_of(
         b"[" + element * ((size - 60) // len(element)) + element.rstrip(b",") + b"]"
     )
 
 
 def text(element: bytes, after: bytes = b"") -> Callable[[int], bytes]:
-    """A string of the same again and again."""
+    """A string of repeated text."""
     return lambda size: message_of(b'"' + element * ((size - 60) // len(element)) + b'"' + after)
 
 
 def with_nan(made: Callable[[int], bytes]) -> Callable[[int], bytes]:
-    """The same, and NaN last."""
+    """The same with NaN at the end."""
     return lambda size: made(size - 4).replace(b"]}}", b",NaN]}}")
 
 
 def many_keys(size: int) -> bytes:
-    """An object with as many fields as will fit."""
+    """An object with as many fields as fit."""
     return message_of(b"{" + b",".join(b'"k%07d":1' % number for number in range((size - 60) // 13)) + b"}")
 
 
@@ -95,7 +95,7 @@ SHAPES: dict[str, tuple[Callable[[int], bytes], str]] = {
 
 
 def handle(data: bytes, type_name: str) -> str:
-    """All the relay does with a message before it goes to the robot; what it says of one it refuses."""
+    """Handles a message as the relay does before sending it to the robot; returns the error of a refused one."""
     try:
         operation = rosbridge.decode(data)
     except SwitchboardError as error:
@@ -110,7 +110,7 @@ def handle(data: bytes, type_name: str) -> str:
 
 
 def seconds(data: bytes, type_name: str, times: int = 2) -> float:
-    """Of the processor, the least of some."""
+    """CPU seconds; the minimum of several runs."""
     handle(b'{"op":"publish","topic":"/a","msg":{}}', type_name)
     found = []
     for _ in range(times):
@@ -121,30 +121,38 @@ def seconds(data: bytes, type_name: str, times: int = 2) -> float:
 
 
 def unit() -> float:
-    """What this machine takes to parse 1 MB of numbers, measured close to what it is compared with."""
-    data, found = b"[" + b"1," * 500_000 + b"1]", []
-    for _ in range(3):
-        began = time.thread_time()
-        json.loads(data)
-        found.append(time.thread_time() - began)
-    return min(found)
+    """CPU seconds of this machine to parse 1 MB of numbers, measured just before the comparison."""
+    data = b"[" + b"1," * 500_000 + b"1]"
+    began = time.thread_time()
+    json.loads(data)
+    return time.thread_time() - began
+
+
+def holds(compared: Callable[[], bool]) -> bool:
+    """Whether a comparison of times holds; it is made again after a moment in which the machine was busy."""
+    return any(compared() for _ in range(3))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("size", [LARGEST - 1000, json_cost.LARGE, json_cost.COUNTED * 2])
+@pytest.mark.parametrize("size", [json_cost.LARGE, json_cost.COUNTED * 2])
 def test_no_shape_of_a_large_message_takes_long(shape: str, size: int) -> None:
-    """Measured against another parser at work on 1 MB. The old way took 20 to 40 times as long for some."""
+    """Compared with another parser on 1 MB. The former parser took 20 to 40 times as long for some."""
     make, type_name = SHAPES[shape]
-    taken = seconds(make(size), type_name)
-    assert taken < 6 * unit(), f"{taken * 1000:.0f} ms"
+    data = make(size)
+    assert holds(lambda: seconds(data, type_name) < 6 * unit())
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_twice_the_message_takes_at_most_some_three_times_as_long(shape: str) -> None:
-    """At sizes of which both are read, or refused."""
+    """At sizes that are both accepted or both refused; the largest takes no longer than the bound above."""
     make, type_name = SHAPES[shape]
     half, whole = make(LARGEST // 2), make(LARGEST - 1000)
-    assert seconds(whole, type_name) < 4 * seconds(half, type_name) + unit()
+
+    def compared() -> bool:
+        taken = seconds(whole, type_name)
+        return taken < 6 * unit() and taken < 4 * seconds(half, type_name) + unit()
+
+    assert holds(compared)
 
 
 @pytest.mark.parametrize(
@@ -155,14 +163,14 @@ def test_twice_the_message_takes_at_most_some_three_times_as_long(shape: str) ->
         (b"1,", "may have 1050000 values (commas), not "),
     ],
 )
-def test_too_much_in_a_large_message_is_refused_in_words(element: bytes, words: str) -> None:
-    """With the count, the limit, and what to do."""
+def test_too_much_in_a_large_message_is_refused_with_a_reason(element: bytes, words: str) -> None:
+    """With the count, the limit, and advice."""
     with pytest.raises(json_cost.TooCostly, match="send bulk as base64, or less") as caught:
         rosbridge.decode(listed(element)(LARGEST - 1000))
     assert words in str(caught.value)
 
 
-def test_what_large_messages_are_for_is_taken() -> None:
+def test_large_message_of_an_allowed_kind_is_accepted() -> None:
     """Pictures, clouds and maps, a million numbers, long texts with escapes, and a path of 1 MB."""
     pose = (
         b'{"header":{"stamp":{"sec":1,"nanosec":2},"frame_id":"map"},"pose":{"position":{"x":1.0,"y":2.0,"z":3.0},'
@@ -177,6 +185,24 @@ def test_what_large_messages_are_for_is_taken() -> None:
     assert handle(message_of(b'"' + raw + b'"'), "a/msg/OfUint8") == ""
 
 
+def test_a_large_message_may_hold_nan() -> None:
+    """As roslibpy writes it, beside a picture or a cloud in base64."""
+    raw = b'"' + base64.b64encode(bytes(7_000_000)) + b'"'
+    operation = rosbridge.decode(message_of(b"[NaN,-Infinity,1]").replace(b"}}", b',"raw":' + raw + b"}}"))
+    assert isinstance(operation, rosbridge.Publish)
+    assert nonfinite.marks_to_null(bytes(operation.msg)).startswith(b'{"data":[null,null,1]')
+    assert (
+        handle(listed(b"1,")(250_000).replace(b"[1", b"[NaN" + b" " * json_cost.LARGE), "a/msg/OfFloat64")
+        == ""
+    )
+
+
+def test_nan_beside_many_escapes_is_refused_with_a_reason() -> None:
+    """It is searched for outside strings."""
+    with pytest.raises(json_cost.TooCostly, match="with NaN or infinity may have 131072 backslashes"):
+        rosbridge.decode(SHAPES["NaN beside a string"][0](LARGEST - 1000))
+
+
 def test_small_messages_are_not_counted() -> None:
-    """They may be all structure."""
+    """They may consist of structure only."""
     rosbridge.decode(listed(b"{},")(60 * KIB))

@@ -41,7 +41,7 @@ def depth_of(value: Any) -> int:
 
 @given(VALUES, st.integers(0, 6), st.booleans())
 def test_depth_is_counted_exactly(value: Any, limit: int, ascii_only: bool) -> None:
-    """A text is refused just when its value nests deeper than the limit; brackets in strings don't count."""
+    """A text is refused exactly if its value nests deeper than the limit; brackets in strings do not count."""
     text = json.dumps(value, ensure_ascii=ascii_only).encode()
     if depth_of(value) > limit:
         with pytest.raises(MalformedMessage, match="deeper than"):
@@ -52,7 +52,7 @@ def test_depth_is_counted_exactly(value: Any, limit: int, ascii_only: bool) -> N
 
 @given(VALUES)
 def test_sane_json_is_decoded(value: Any) -> None:
-    """What other writers of JSON make is understood."""
+    """Output of other JSON writers is accepted."""
     assert jsontext.decode_any(json.dumps(value).encode()) == value
 
 
@@ -68,13 +68,13 @@ def test_junk_raises_nothing_but_malformed(data: bytes) -> None:
 
 @pytest.mark.parametrize("bracket", [b"[", b'{"a":'])
 def test_a_hundred_thousand_levels_are_refused(bracket: bytes) -> None:
-    """Depth can't exhaust the stack."""
+    """Depth cannot exhaust the stack."""
     with pytest.raises(MalformedMessage, match=f"deeper than {JSON_DEPTH}"):
         jsontext.decode_any(bracket * 100_000)
 
 
-def test_invalid_utf8_is_refused_even_where_nobody_looks() -> None:
-    """A value that the decoder skips is checked too."""
+def test_invalid_utf8_is_refused_even_in_unused_fields() -> None:
+    """Values that the decoder skips are checked too."""
 
     class Wanted(msgspec.Struct):
         a: int
@@ -88,14 +88,14 @@ def test_invalid_utf8_is_refused_even_where_nobody_looks() -> None:
 @pytest.mark.parametrize(
     "text", [b"NaN", b"[Infinity]", b"-Infinity", b'{"a":nan}', b"1 2", b"", b"\xef\xbb\xbf{}"]
 )
-def test_what_is_no_json_is_refused(text: bytes) -> None:
-    """NaN, Infinity, trailing text, nothing at all and a byte order mark are not JSON."""
+def test_invalid_json_is_refused(text: bytes) -> None:
+    """NaN, Infinity, trailing text, empty text and a byte order mark are not JSON."""
     with pytest.raises(MalformedMessage):
         jsontext.decode_any(text)
 
 
 def test_a_number_of_five_thousand_digits_is_refused() -> None:
-    """It is told to be out of range."""
+    """The error says that it is out of range."""
     with pytest.raises(MalformedMessage, match="out of range"):
         jsontext.decode_any(b"[" + b"1" * 5000 + b"]")
 
@@ -104,7 +104,7 @@ def test_a_number_of_five_thousand_digits_is_refused() -> None:
     "text", [b"1" * 400, b"-" + b"1" * 400, b"2" * 309, b"1e999", b"[1,%s]" % (b"1" * 400)]
 )
 def test_a_number_that_no_double_can_hold_is_refused(text: bytes) -> None:
-    """However it is written; the longest that fits is taken."""
+    """In any notation; the longest that fits is accepted."""
     with pytest.raises(MalformedMessage):
         jsontext.decode_any(text)
     for fits in (b"1" * 309, b"1" * 400 + b"e-300", b'"%s"' % (b"1" * 400)):
@@ -128,9 +128,9 @@ PIECES = st.sampled_from(
     st.sampled_from([b'{"kept":%s}', b'{"kept":1,"skipped":%s}', b'{"skipped":[%s],"kept":1}']),
     st.lists(PIECES, max_size=12).map("".join) | VALUES.map(json.dumps),
 )
-@settings(max_examples=500)
-def test_what_is_kept_undecoded_or_skipped_is_json_all_the_same(around: bytes, inside: str) -> None:
-    """Passing a part of a checked text on as it is can't pass on what is not JSON, but for the size of numbers."""
+@settings(max_examples=150)
+def test_undecoded_parts_are_valid_json(around: bytes, inside: str) -> None:
+    """Passing on a part of a checked text cannot pass on invalid JSON, except for the size of numbers."""
     data = around % inside.encode()
     try:
         value = json.loads(data, parse_constant=_no)
@@ -146,7 +146,7 @@ def test_what_is_kept_undecoded_or_skipped_is_json_all_the_same(around: bytes, i
         assert sane, data
         json.loads(bytes(found), parse_constant=_no)
     elif sane:
-        # Python's reader takes lone surrogates, which are no characters.
+        # Python's parser accepts lone surrogates, which are no characters.
         assert "\\u" in inside
 
 
@@ -180,9 +180,11 @@ JSON = st.recursive(
 
 
 @given(JSON, st.text('0123456789eE+-.,[]{}"', max_size=3), st.integers(0, 1000))
-@settings(max_examples=1000)
-def test_what_is_in_range_at_a_glance_any_reader_takes(text: str, junk: str, at: int) -> None:
-    """What msgspec has skipped as JSON and seems to have no number that is too large: orjson and json read it."""
+@settings(max_examples=250)
+def test_json_without_extremes_takes_the_fast_reader(text: str, junk: str, at: int) -> None:
+    """JSON that msgspec has skipped and that seems to have no number too large is accepted by orjson and
+    json.
+    """
     at %= len(text) + 1
     body = (text[:at] + junk + text[at:]).encode()
     try:
@@ -200,11 +202,17 @@ def test_what_is_in_range_at_a_glance_any_reader_takes(text: str, junk: str, at:
     "usual", [b"0.5", b"-12", b"1e-05", b"1.5e-300", b'{"linear":{"x":0.1}}', b"9" * 308]
 )
 def test_usual_numbers_are_known_at_a_glance(usual: bytes) -> None:
-    """Or every message would be read once more."""
+    """Otherwise every message would be parsed once more."""
     assert jsontext.in_range(usual)
 
 
 @pytest.mark.parametrize("large", [b"1e5", b"1e+400", b"1E400", b"-1e309", b"9" * 309, b"0.1e999"])
-def test_what_may_be_too_large_has_to_be_read(large: bytes) -> None:
-    """Whether it is."""
+def test_possibly_too_large_numbers_are_read(large: bytes) -> None:
+    """The parser decides."""
     assert not jsontext.in_range(large)
+
+
+@pytest.mark.parametrize("text", [b"}" * 3000, b'{"a":1}}' + b" " * 3000, b'{"a":"' + b"x" * 3000 + b'"}}'])
+def test_a_long_text_with_too_many_closing_brackets_is_malformed(text: bytes) -> None:
+    with pytest.raises(MalformedMessage, match="not JSON"):
+        jsontext.check_keys(text)

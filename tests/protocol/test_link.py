@@ -28,6 +28,8 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Annotated:
         (meta,) = arguments[1:]
+        if meta.pattern is not None:
+            return st.from_regex(meta.pattern)
         if meta.gt is not None:
             return st.floats(meta.gt, meta.le, exclude_min=True)
         if meta.ge is None:
@@ -68,7 +70,7 @@ def structs(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
 def _made(kind: type[msgspec.Struct], fields: dict[str, Any]) -> Any:
     try:
         return kind(**fields)
-    except ValueError:  # a rule of the whole message, such as the least time of a suppression
+    except ValueError:  # a rule for the whole message, such as the minimum time of a suppression
         reject()
 
 
@@ -83,7 +85,7 @@ def comparable(value: Any) -> Any:
 
 @given(st.sampled_from(MESSAGES), st.data())
 def test_every_message_survives_the_wire(case: tuple[str, type[msgspec.Struct]], data: st.DataObject) -> None:
-    """Encoded, framed, cut out and decoded, each message of each link is what it was."""
+    """Each message of each link is encoded, framed, split and decoded unchanged."""
     decoder, message = case
     sent = data.draw(structs(message))
     (frame,) = frames.FrameDecoder(limit=100_000).feed(link.frame(sent))
@@ -93,66 +95,69 @@ def test_every_message_survives_the_wire(case: tuple[str, type[msgspec.Struct]],
 
 @given(st.sampled_from(sorted(DECODERS)), st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
 def test_junk_raises_nothing_but_malformed(decoder: str, data: bytes) -> None:
-    """No bytes make a decoder fail otherwise."""
+    """Any bytes are a message or this error."""
     with pytest.raises(MalformedMessage):
         jsontext.decode(DECODERS[decoder], data)
 
 
 def test_tags_are_the_snake_case_names() -> None:
-    """The op of a message follows from its name."""
+    """The op of a message follows from its class name."""
     tags = {message.__struct_config__.tag for _, message in MESSAGES}
     assert {"open_channel", "call_service", "type_definition", "hello"} <= tags
 
 
 def test_defaults_are_left_out() -> None:
-    """A sender writes only what is not the default."""
+    """Only other values are written."""
     assert (
         jsontext.encode(link.Subscribe(number=1, topic="/a")) == b'{"op":"subscribe","number":1,"topic":"/a"}'
     )
 
 
 def test_unknown_fields_are_passed_over() -> None:
-    """A newer peer may say more."""
+    """A newer peer may send more fields."""
     message = jsontext.decode(link.relay_control_decoder, b'{"op":"bye","reason":"x","later":[1]}')
     assert message == link.Bye(reason="x")
 
 
-def test_an_unknown_op_is_told_with_those_known() -> None:
-    """The error says what would have been right here."""
+def test_error_for_an_unknown_op_lists_the_known_ones() -> None:
+    """The error lists the ones valid here."""
     with pytest.raises(MalformedMessage) as caught:
         jsontext.decode(link.relay_control_decoder, b'{"op":"subscribe","number":1,"topic":"/a"}')
-    known = "bye, close_channel, close_video, control, inhibit, open_channel, open_video, ping, pong, resume, stop"
-    assert str(caught.value) == f"unknown op 'subscribe'; known are {known}, suppress"
+    known = (
+        "bye, close_channel, close_video, control_grant, inhibit, measure_processes, open_channel, open_file_link, "
+        "open_video, order_module, ping, pong, read_module_log, resume, stop, suppress"
+    )
+    assert str(caught.value) == f"unknown op 'subscribe'; known are {known}"
 
 
 def test_a_long_unknown_op_is_cut_short() -> None:
-    """A stranger's text does not fill the log."""
+    """Text of a peer must not fill the log."""
     with pytest.raises(MalformedMessage) as caught:
-        jsontext.decode(link.opening_decoder, b'{"op":"' + b"x" * 10_000 + b'"}')
+        jsontext.decode(link.handshake_request_decoder, b'{"op":"' + b"x" * 10_000 + b'"}')
     assert len(str(caught.value)) < 120
 
 
 def test_a_missing_field_is_named() -> None:
     """The error says what is missing."""
     with pytest.raises(MalformedMessage, match="missing required field `nonce`"):
-        jsontext.decode(link.opening_reply_decoder, b'{"op":"challenge","relay":"r"}')
+        jsontext.decode(link.handshake_reply_decoder, b'{"op":"challenge","relay":"r"}')
 
 
 @given(st.binary(max_size=40))
 def test_base64_fields_survive(data: bytes) -> None:
-    """Bytes in a JSON field come back as they were."""
+    """Bytes in a JSON field are returned unchanged."""
     assert link.from_base64(link.to_base64(data), "x") == data
 
 
 @pytest.mark.parametrize("text", ["a", "ab=c", "####", "YQ", "ß", "YQ==\n"])
-def test_what_is_no_base64_is_refused_by_name(text: str) -> None:
+def test_invalid_base64_is_refused_by_name(text: str) -> None:
     """The error names the field."""
     with pytest.raises(Invalid, match="nonce is not base64"):
         link.from_base64(text, "nonce")
 
 
-LONG = "x" * (limits.LABEL + 1)
-MANY = ["x"] * (limits.GRAPH_ENDS + 1)
+LONG = "x" * (limits.LABEL_LENGTH + 1)
+MANY = ["x"] * (limits.GRAPH_NODES + 1)
 
 
 @pytest.mark.parametrize(
@@ -161,8 +166,8 @@ MANY = ["x"] * (limits.GRAPH_ENDS + 1)
         {"op": "describe", "host": LONG},
         {"op": "describe", "extra": {LONG: ""}},
         {"op": "describe", "extra": {"a": LONG}},
-        {"op": "describe", "extra": {str(number): "" for number in range(limits.FACTS + 1)}},
-        {"op": "describe", "motion": {"types": ["x"] * (limits.FACTS + 1)}},
+        {"op": "describe", "extra": {str(number): "" for number in range(limits.LIST_ITEMS + 1)}},
+        {"op": "describe", "motion": {"types": ["x"] * (limits.LIST_ITEMS + 1)}},
         {"op": "describe", "motion": {"topics": [LONG]}},
         {"op": "graph", "topics": {LONG: {"types": []}}},
         {"op": "graph", "topics": {"/a": {"types": [], "publishers": MANY}}},
@@ -172,14 +177,14 @@ MANY = ["x"] * (limits.GRAPH_ENDS + 1)
     ],
     ids=lambda message: "-".join(message),
 )
-def test_what_a_robot_tells_of_itself_is_bounded(message: dict[str, Any]) -> None:
-    """No field is longer, no list has more than the contract says."""
+def test_description_of_a_robot_is_bounded(message: dict[str, Any]) -> None:
+    """Fields and lists have the contract's limits."""
     with pytest.raises(MalformedMessage, match="length <="):
         jsontext.decode(link.robot_control_decoder, jsontext.encode(message))
 
 
 def test_a_definition_is_bounded() -> None:
-    """A text over the limit is not taken."""
+    """A text over the limit is refused."""
     message = {"op": "type_definition", "type": "a/msg/B", "text": "#" * (limits.TYPE_DEFINITION + 1)}
     with pytest.raises(MalformedMessage, match="length <="):
         jsontext.decode(link.robot_channel_decoder, jsontext.encode(message))
@@ -190,14 +195,30 @@ def test_a_definition_is_bounded() -> None:
     [
         (link.Bye, "reason", {}),
         (link.Alert, "text", {"level": "info"}),
-        (link.Failed, "reason", {"what": "subscribe", "ref": "1"}),
+        (link.Failed, "reason", {"request": "subscribe", "reference": "1"}),
         (link.ServiceResponse, "reason", {"id": "1", "result": False}),
     ],
 )
-def test_words_for_people_are_cut(kind: Any, field: str, fields: dict[str, Any]) -> None:
-    """On the way out and on the way in: a long sentence costs nobody the link."""
-    long = "x" * (limits.WORDS + 1)
-    assert len(getattr(kind(**fields, **{field: long}), field)) == limits.WORDS
+def test_texts_are_cut(kind: Any, field: str, fields: dict[str, Any]) -> None:
+    """In both directions: a long text ends no link."""
+    long = "x" * (limits.TEXT_LENGTH + 1)
+    assert len(getattr(kind(**fields, **{field: long}), field)) == limits.TEXT_LENGTH
     body = jsontext.encode({"op": link.lower_tag(kind.__name__), **fields, field: long})
     decoder = link.robot_control_decoder if kind is link.Alert else link.robot_channel_decoder
-    assert getattr(jsontext.decode(decoder, body), field) == "x" * (limits.WORDS - 1) + "…"
+    assert getattr(jsontext.decode(decoder, body), field) == "x" * (limits.TEXT_LENGTH - 1) + "…"
+
+
+@pytest.mark.parametrize(
+    ("service", "moves"),
+    [
+        ("/reset", True),
+        ("/resets", False),
+        ("/dock/_action/send_goal", True),
+        ("/dock/_action/get_result", False),
+        ("/undock/_action/send_goal", False),
+        ("/dock/_action/send_goal/x", False),
+    ],
+)
+def test_a_service_that_accepts_goals_moves_the_robot_as_its_action_does(service: str, moves: bool) -> None:
+    policy = link.MotionPolicy(services=["/reset"], actions=["/dock"])
+    assert policy.moves_by_service(service) is moves

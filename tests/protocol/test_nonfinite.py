@@ -1,4 +1,4 @@
-"""NaN and infinity as Python's ``json`` writes them, in what clients send."""
+"""NaN and infinity in the form of Python's ``json``, in clients' messages."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import time
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,14 +15,14 @@ from hypothesis import strategies as st
 from relay_protocol import nonfinite, rosbridge
 from relay_protocol.errors import Invalid, MalformedMessage, SwitchboardError
 from relay_protocol.nonfinite import NotFinite
-from tests.protocol.ros_texts import LINE, registry
+from tests.worlds.ros_texts import LINE, registry
 
 TYPES = registry(
     B="float32 x\nfloat64 y\nint64 whole\nuint8[] raw\nfloat32[] f\nfloat64[2] g\nstring text\nbool on\nN[] n\n"
     f"std_msgs/Header header\n{LINE}\nMSG: a/N\nfloat64 v\n"
     f"{LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 )
-WORDS = st.text(max_size=4) | st.sampled_from(
+WORDS = st.text(max_size=4).filter(lambda word: word not in nonfinite.NUMBERS) | st.sampled_from(
     ["NaN", "-Infinity", '"NaN', "NaN\\", '\\"', "\\\\", "Infinity,"]
 )
 VALUES = st.recursive(
@@ -32,32 +33,32 @@ VALUES = st.recursive(
 
 
 def message_of(msg: str) -> rosbridge.Publish:
-    """What is made of a ``publish`` with this body."""
+    """The decoded ``publish`` with this body."""
     made = rosbridge.decode(f'{{"op":"publish","id":"q","topic":"/a","msg":{msg}}}'.encode())
     assert isinstance(made, rosbridge.Publish)
     return made
 
 
 @given(VALUES, st.sampled_from([None, 1]), st.booleans())
-def test_whatever_pythons_json_writes_is_read_as_it_reads_it(
+def test_output_of_pythons_json_is_read_as_python_reads_it(
     value: Any, indent: int | None, ascii: bool
 ) -> None:
-    """Also where words within strings look like these literals."""
+    """Also with strings that look like these literals."""
     text = json.dumps(value, indent=indent, ensure_ascii=ascii)
     try:
         body = bytes(message_of(text).msg)
     except MalformedMessage as error:
         assert "surrogate" in str(error) or "UTF-8" in str(error) or "range" in str(error)
         return
-    assert repr(nonfinite.plain(json.loads(body))) == repr(value)
+    assert repr(nonfinite.to_floats(json.loads(body))) == repr(value)
 
 
 @given(VALUES)
 def test_without_them_strict_json_is_left(value: Any) -> None:
-    """They are null, and all else is the same to the letter."""
+    """They become null, and the rest is unchanged to the letter."""
     strict = json.dumps(_nulled(value), allow_nan=False)
     marked = nonfinite.mark(json.dumps(value).encode())
-    assert nonfinite.as_null(marked).decode() == strict
+    assert nonfinite.marks_to_null(marked).decode() == strict
 
 
 def _nulled(value: Any) -> Any:
@@ -75,14 +76,14 @@ def _nulled(value: Any) -> Any:
         st.sampled_from(['"', "\\", "NaN", "-", "Infinity", "{", "}", "[", "]", ":", ",", "1", " ", "a"])
     )
 )
-def test_junk_raises_nothing_but_errors_in_words(pieces: list[str]) -> None:
-    """And what is taken is JSON."""
+def test_junk_raises_only_protocol_errors(pieces: list[str]) -> None:
+    """Accepted texts are JSON."""
     text = "".join(pieces)
     try:
         body = bytes(message_of(text).msg)
     except SwitchboardError:
         return
-    json.loads(nonfinite.as_null(body), parse_constant=lambda word: pytest.fail(word))
+    json.loads(nonfinite.marks_to_null(body), parse_constant=lambda word: pytest.fail(word))
 
 
 @pytest.mark.parametrize("piece", ['"",', '"\\"NaN",', "NaN,", '"\\\\', "-Infinity ", '"NaN', " " * 9, '\\"'])
@@ -113,11 +114,11 @@ def test_time_is_linear(piece: str) -> None:
         ("NaN", "a/msg/B must be an object, not NaN"),
         ('{"header":{"seq":1}}', "a/msg/B: header.seq is no field of std_msgs/msg/Header in ROS 2; leave it out"),
         ('{"header":{"stamp":"now"}}', 'a/msg/B: header.stamp must be an object, not a string: send '
-         '{"sec": ..., "nanosec": ...}, or leave the stamp of a header out for the present time'),
+         '{"sec": ..., "nanosec": ...}, or leave the stamp of a header out for the current time'),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_told_with_what_to_send_instead(msg: str, reason: str) -> None:
-    """By field, with the client's own word."""
+def test_mismatched_field_is_refused_with_what_to_send_instead(msg: str, reason: str) -> None:
+    """By field, with the client's own value."""
     with pytest.raises(Invalid) as caught:
         TYPES.from_json("a/msg/B", bytes(message_of(msg).msg), 0)
     assert str(caught.value) == reason
@@ -125,7 +126,7 @@ def test_what_does_not_fit_is_told_with_what_to_send_instead(msg: str, reason: s
 
 @pytest.mark.parametrize("base64", ["AQID", "AQ\\r\\nID", "AQ\\nID\\n", "\\nAQID"])
 def test_base64_may_have_line_breaks(base64: str) -> None:
-    """As encoders for mail write it, RFC 2045 section 6.8."""
+    """As mail encoders write it, RFC 2045 section 6.8."""
     cdr = TYPES.from_json("a/msg/B", bytes(message_of(f'{{"raw":"{base64}"}}').msg), 0)
     assert json.loads(TYPES.to_json("a/msg/B", cdr))["raw"] == "AQID"
 
@@ -141,9 +142,15 @@ def test_base64_may_have_line_breaks(base64: str) -> None:
         ('{"op":"advertise","topic":"/a","type":"a/B","qos":{"depth":NaN}}', "qos: ", None),
     ],
 )  # fmt: skip
-def test_outside_of_a_body_they_are_refused_in_words(text: str, reason: str, id: rosbridge.Id) -> None:
-    """The id is known all the same."""
+def test_outside_of_a_body_they_are_refused_with_a_reason(text: str, reason: str, id: rosbridge.Id) -> None:
+    """The id is still found."""
     with pytest.raises(NotFinite) as caught:
         rosbridge.decode(text.encode())
-    assert str(caught.value).startswith(f"{reason}NaN and infinity are no JSON")
+    assert str(caught.value).startswith(f"{reason}NaN and infinity are not JSON")
     assert rosbridge.unreadable(text.encode()).id == id
+
+
+def test_base64_of_more_than_a_mebibyte_may_hold_the_letters_of_a_literal() -> None:
+    text = json.dumps({"data": "NaN" + "A" * 1_100_000}).encode()
+    decoded = nonfinite.decode(msgspec.json.Decoder(dict[str, str]), text, ())
+    assert decoded["data"].startswith("NaN")

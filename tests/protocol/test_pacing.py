@@ -1,4 +1,4 @@
-"""The window of a sender on links of all kinds, in simulated time."""
+"""A sender's window on links of all kinds, in simulated time."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ STEP = 0.002
 
 
 class Link:
-    """A link of one rate with an endless queue in front, as a proxy and a kernel have it, and a sender on it.
+    """A link with one rate and an endless queue, as of a proxy and a kernel, and its sender.
 
-    :param rate: bytes a second
-    :param way: seconds, both ways together
-    :param stalls: (begin, end): nothing arrives in between; what was due arrives at the end
+    :param rate: bytes per second
+    :param round_trip: seconds
+    :param stalls: (begin, end): nothing arrives in between; delayed bytes arrive at the end
     """
 
-    def __init__(self, rate: float, way: float, stalls: tuple[tuple[float, float], ...] = ()) -> None:
-        self.rate, self.way, self.stalls = rate, way, stalls
+    def __init__(self, rate: float, round_trip: float, stalls: tuple[tuple[float, float], ...] = ()) -> None:
+        self.rate, self.round_trip, self.stalls = rate, round_trip, stalls
         self.window = SendWindow()
         self.chunk = min(16_000, max(500, int(rate * STEP)))
         """Bytes the sender writes at a time."""
@@ -38,7 +38,7 @@ class Link:
         self._probed = 0
 
     def run(self, seconds: float, offered: float) -> None:
-        """Send so many bytes a second, as far as the window allows; more than that is dropped."""
+        """Sends this many bytes per second, within the window; the rest is dropped."""
         end, owed = self.now + seconds, 0.0
         pinged = self.now
         while self.now < end:
@@ -67,33 +67,33 @@ class Link:
         key = next(self._serial)
         self.window.probe(key, self.now, full=full)
         self._probed = self.window.sent
-        at = max(self.now, self.free_at) + self.way
+        at = max(self.now, self.free_at) + self.round_trip
         for begin, end in self.stalls:
             if begin <= at < end:
                 at = end
         heapq.heappush(self._answers, (at, key, self.now))
 
     def late(self, since: float) -> list[float]:
-        """How much longer than on the empty link each probe took, from some time on."""
-        return [trip - self.way for at, trip in self.delays if at >= since]
+        """The additional delay of each probe over the empty link, from a given time on."""
+        return [trip - self.round_trip for at, trip in self.delays if at >= since]
 
 
-@given(rate=st.floats(20_000, 20_000_000), way=st.floats(0.0005, 0.3), more=st.floats(1.2, 30))
+@given(rate=st.floats(20_000, 20_000_000), round_trip=st.floats(0.0005, 0.3), more=st.floats(1.2, 30))
 @settings(deadline=None, max_examples=25)
 def test_a_probe_waits_little_on_any_link_and_the_link_stays_busy(
-    rate: float, way: float, more: float
+    rate: float, round_trip: float, more: float
 ) -> None:
-    """Whatever the rate and the round trip, and however much more is offered than the link carries."""
-    link = Link(rate, way)
+    """For any rate and round trip, and any excess of offered data."""
+    link = Link(rate, round_trip)
     link.run(16, more * rate)
     late = link.late(since=10)
-    # The least window takes its time on a very thin link.
-    assert statistics.median(late) <= 1.6 * TARGET + 0.3 * way + 2 * LEAST / rate
+    # The minimum window takes long on a very slow link.
+    assert statistics.median(late) <= 1.6 * TARGET + 0.3 * round_trip + 2 * LEAST / rate
     assert link.passed >= 0.6 * 16 * rate
 
 
 def test_a_link_that_becomes_thin_and_free_again_is_followed() -> None:
-    """Within two seconds each way."""
+    """Within two seconds in each direction."""
     link = Link(5_000_000, 0.02)
     link.run(5, 2_000_000)
     link.rate = 100_000
@@ -108,7 +108,7 @@ def test_a_link_that_becomes_thin_and_free_again_is_followed() -> None:
 
 
 def test_a_machine_that_answers_late_does_not_make_a_link_thin() -> None:
-    """Half of the time nothing is answered; what is sent needs no more than the window, so that stays."""
+    """Half of the time there are no answers; the sent data needs only the window, so that stays."""
     stalls = tuple((1 + number / 2, 1.25 + number / 2) for number in range(20))
     link = Link(50_000_000, 0.001, stalls)
     link.run(10, 100_000)
@@ -118,10 +118,10 @@ def test_a_machine_that_answers_late_does_not_make_a_link_thin() -> None:
 
 
 def test_a_link_that_becomes_longer_is_measured_again() -> None:
-    """From then on the window is for the longer round trip."""
+    """From then on the window fits the longer round trip."""
     link = Link(1_000_000, 0.01)
     link.run(5, 3_000_000)
-    link.way = 0.3
+    link.round_trip = 0.3
     link.run(8, 3_000_000)
     before = link.passed
     link.run(5, 3_000_000)
@@ -129,7 +129,7 @@ def test_a_link_that_becomes_longer_is_measured_again() -> None:
 
 
 def test_an_answer_to_no_probe_changes_nothing() -> None:
-    """A peer may send pongs unasked (RFC 6455 section 5.5.3)."""
+    """A peer may send unsolicited pongs (RFC 6455 section 5.5.3)."""
     window = SendWindow()
     window.sent = 1000
     window.probe(b"a", 0.0, full=False)

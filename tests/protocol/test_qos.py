@@ -1,4 +1,4 @@
-"""Quality of service as clients write it."""
+"""Quality of service in clients' messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INFINITE = {"sec": 9223372036, "nanosec": 854775807}
 
 
 def asked(**qos: Any) -> dict[str, Any]:
-    """What goes to the robot for a qos."""
+    """The QoS sent to the robot for a client's."""
     text = json.dumps({"op": "subscribe", "topic": "/a", "qos": qos})
     message = rosbridge.decode(text.encode())
     assert isinstance(message, rosbridge.Subscribe)
@@ -46,7 +46,7 @@ def asked(**qos: Any) -> dict[str, Any]:
     ],
 )  # fmt: skip
 def test_all_that_clients_write_becomes_one_form(qos: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """What means the same goes to the robot in the same words; what says nothing is left out."""
+    """Equivalent values become equal, and default values are left out."""
     assert asked(**qos) == wanted
 
 
@@ -54,25 +54,25 @@ def test_all_that_clients_write_becomes_one_form(qos: dict[str, Any], wanted: di
     ("qos", "reason"),
     [
         ({"reliability": "sometimes"},
-         "reliability is reliable, best_effort, best_available or system_default, not 'sometimes'"),
-        ({"durability": 1}, "durability is volatile, transient_local, best_available or system_default, not 1"),
-        ({"history": ["keep_last"]}, "history is keep_last, keep_all or system_default, not a value of type list"),
-        ({"depth": 2.5}, "depth is a whole number of messages, 0 for the usual, not 2.5"),
+         "reliability must be reliable, best_effort, best_available or system_default, not 'sometimes'"),
+        ({"durability": 1}, "durability must be volatile, transient_local, best_available or system_default, not 1"),
+        ({"history": ["keep_last"]}, "history must be keep_last, keep_all or system_default, not a value of type list"),
+        ({"depth": 2.5}, "depth must be a whole number of messages, 0 for the default, not 2.5"),
         ({"depth": -1}, "not -1"),
         ({"depth": True}, "not a value of type bool"),
         ({"depth": "5"}, "not '5'"),
-        ({"depth": 10**30}, "depth is a whole number"),
-        ({"deadline": -1}, "deadline is a time in seconds, an object with sec and nanosec, or 'infinite' or"),
+        ({"depth": 10**30}, "depth must be a whole number"),
+        ({"deadline": -1}, "deadline must be a time in seconds, an object with sec and nanosec, or 'infinite' or"),
         ({"lifespan": "best_available"}, "or 'infinite', not 'best_available'"),
-        ({"lifespan": {}}, "lifespan is a time"),
-        ({"lifespan": {"sec": "1"}}, "lifespan is a time"),
-        ({"lifespan": {"sec": 1, "nanosec": -1}}, "lifespan is a time"),
+        ({"lifespan": {}}, "lifespan must be a time"),
+        ({"lifespan": {"sec": "1"}}, "lifespan must be a time"),
+        ({"lifespan": {"sec": 1, "nanosec": -1}}, "lifespan must be a time"),
         ({"lifespan": [1, 2]}, "not a value of type list"),
-        ({"lifespan": 10**400}, "lifespan is a time"),
-        ({"deadline": False}, "deadline is a time"),
+        ({"lifespan": 10**400}, "lifespan must be a time"),
+        ({"deadline": False}, "deadline must be a time"),
     ],
 )  # fmt: skip
-def test_what_is_unknown_is_told_with_what_is_known(qos: dict[str, Any], reason: str) -> None:
-    """The error names the policy, what it may be, and what was said."""
+def test_unknown_name_is_reported_with_the_known_ones(qos: dict[str, Any], reason: str) -> None:
+    """The error has the policy, its valid values, and the given one."""
     with pytest.raises(MalformedMessage, match=reason):
         asked(**qos)

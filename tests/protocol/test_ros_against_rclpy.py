@@ -12,13 +12,13 @@ import orjson
 import pytest
 from hypothesis import given, settings
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import EVERY, decoded, installed, messages, thorough, walk_message, whole_text
 from rosbags.typesys import Stores, get_typestore
 
-from relay_protocol.ros import fast_reader, fast_writer
-from relay_protocol.ros.reader import ReaderFactory
-from relay_protocol.ros.writer import WriterFactory
+from relay_protocol.ros import generated_cdr_to_json, generated_json_to_cdr
+from relay_protocol.ros.cdr_to_json import ReaderFactory
+from relay_protocol.ros.json_to_cdr import WriterFactory
 from relay_protocol.ros_types import TypeRegistry
+from tests.worlds.ros_messages import EVERY, decoded, installed, messages, thorough, walk_message, whole_text
 
 BAGS = get_typestore(Stores.ROS2_JAZZY)
 """A third implementation. It fills gaps with zeros as we do; rclpy leaves in them what was in memory."""
@@ -31,12 +31,12 @@ for owner, text in TEXTS.items():
 
 
 def refuse(*arguments: Any) -> bytes:
-    """Stands for the closures where generated code must not need them."""
+    """Replaces the closures where generated code must not need them."""
     raise AssertionError
 
 
 def test_many_types_are_compared() -> None:
-    """The packages this suite is about are there, and all parts of services and actions."""
+    """The packages of this suite are installed, and all parts of services and actions."""
     packages = {name.split("/")[0] for name in TYPES}
     assert {"std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "diagnostic_msgs"} <= packages
     assert {"trajectory_msgs", "std_srvs", "rcl_interfaces", "switchboard_test_interfaces"} <= packages
@@ -48,18 +48,20 @@ def test_many_types_are_compared() -> None:
 
 @pytest.mark.parametrize("name", TYPES)
 def test_default_message_equals_rclpys(name: str) -> None:
-    """A message nobody filled is what rclpy makes it, defaults of the definition included."""
+    """An empty message has rclpy's values, with defaults of the definition."""
     cls = TYPES[name].cls
     assert deserialize_message(REGISTRY.zero(name), cls) == cls()
     assert REGISTRY.from_json(name, b"{}", 0) == REGISTRY.from_json(name, {}, 0) == REGISTRY.zero(name)
 
 
-# Hypothesis runs inside the tests: as decorators of parametrized tests it and the Twisted plugin trip over each other.
+# Hypothesis runs inside the tests: its decorators on parametrized tests conflict with the Twisted plugin.
 @pytest.mark.parametrize("name", TYPES)
 def test_messages_from_rclpy_are_read(name: str) -> None:
-    """rclpy's bytes become the JSON and CBOR that a plain walk over the message gives, by every way there is."""
+    """rclpy's bytes become the JSON and CBOR of an independent conversion, by every code path."""
     cls, definitions = TYPES[name].cls, REGISTRY._types[name].definitions
-    fast = {form: fast_reader.generate(name, definitions, form, refuse) for form in ("json", "cbor")}
+    fast = {
+        form: generated_cdr_to_json.generate(name, definitions, form, refuse) for form in ("json", "cbor")
+    }
     slow = {form: ReaderFactory(definitions, "<", form == "cbor") for form in ("json", "cbor")}
 
     @thorough(name)
@@ -81,15 +83,18 @@ def test_messages_from_rclpy_are_read(name: str) -> None:
 
 
 def dumped(value: Any) -> bytes:
-    """What the closures read, as text."""
+    """The closures' result, as text."""
     return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
 @pytest.mark.parametrize("name", TYPES)
 def test_messages_for_rclpy_are_written(name: str) -> None:
-    """JSON becomes the message that rclpy would have sent: it reads it so, and the bytes are its own."""
+    """JSON becomes the message that rclpy would have sent: rclpy reads it, and the bytes are equal."""
     cls, definitions = TYPES[name].cls, REGISTRY._types[name].definitions
-    fast, slow = fast_writer.generate(name, definitions)(refuse), WriterFactory(definitions).writer(name)
+    fast, slow = (
+        generated_json_to_cdr.generate(name, definitions)(refuse),
+        WriterFactory(definitions).writer(name),
+    )
 
     @thorough(name)
     @given(messages(cls, finite=True))
@@ -111,17 +116,17 @@ def test_messages_for_rclpy_are_written(name: str) -> None:
 
 
 def same_but_for_gaps(ours: bytes, theirs: bytes) -> bool:
-    """Whether all of ours is in theirs, except the zeros that fill gaps.
+    """Whether theirs contains all of ours, except zeros in padding.
 
-    rclpy leaves in gaps what was in memory, and at the end there is more of it: it pads, and counts gaps before
-    empty sequences that it does not write.
+    rclpy leaves arbitrary memory in padding, and adds more at the end: it pads, and counts gaps before empty
+    sequences that it does not write.
     """
     return len(ours) <= len(theirs) and all(mine in (its, 0) for mine, its in zip(ours, theirs, strict=False))
 
 
 @pytest.mark.parametrize("name", TYPES)
 def test_numbers_json_lacks_come_back_as_nan(name: str) -> None:
-    """NaN and infinity are null on the way out and NaN on the way in; all else is the same."""
+    """NaN and infinity become null, and null becomes NaN; the rest is unchanged."""
     cls = TYPES[name].cls
 
     @settings(EVERY, max_examples=3)

@@ -68,7 +68,7 @@ TEXTS = (
 
 
 def seen_by_us(found: Definition) -> list[Any]:
-    """What we read, as plain values."""
+    """The relay's result, as plain values."""
     fields = [(each.name, *_type(each.type), _plain(each.default)) for each in found.fields]
     return [fields, [(each.name, each.type.base, _plain(each.value)) for each in found.constants]]
 
@@ -78,7 +78,7 @@ def _type(kind: FieldType) -> tuple[Any, ...]:
 
 
 def seen_by_rosidl(found: Any) -> list[Any]:
-    """The same of rosidl's."""
+    """rosidl's result."""
     fields = []
     for each in found.fields:
         kind = each.type
@@ -89,7 +89,7 @@ def seen_by_rosidl(found: Any) -> list[Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Something that equals itself, NaN too."""
+    """A value that equals itself, NaN too."""
     if isinstance(value, list):
         return [_plain(each) for each in value]
     return repr(value) if isinstance(value, float) and not math.isfinite(value) else value
@@ -106,7 +106,7 @@ def test_every_form_is_read_as_rosidl_reads_it(text: str, package: str) -> None:
 
 @pytest.mark.parametrize("kind", ["msg", "srv", "action"])
 def test_a_header_is_of_its_own_package_first(kind: str) -> None:
-    """Only where the package has none it is that of std_msgs, at any depth and in every part."""
+    """If the package has none, it is that of std_msgs, at any depth and in every part."""
     divider = {"msg": "", "srv": "---\n", "action": "---\n---\n"}[kind]
     texts = {
         f"a/{kind}/Top": f"Header header\nb/Inner inner\nc/Inner other\n{divider}",

@@ -1,4 +1,4 @@
-"""CBOR as it is on the wire: against RFC 8949 and 8746, and read by an unmodified roslib.js."""
+"""CBOR on the wire: compared with RFC 8949 and 8746, and read by an unmodified roslib.js."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import cbor2
 import pytest
 from hypothesis import given
 from rclpy.serialization import serialize_message
-from ros_messages import bits, class_of, installed, messages, slots, thorough, whole_text
 from rosidl_parser import definition as idl
 
 from relay_protocol.errors import Invalid
 from relay_protocol.ros_types import TypeRegistry
-from tests.protocol.ros_texts import registry
+from tests.worlds.ros_messages import bits, class_of, installed, messages, slots, thorough, whole_text
+from tests.worlds.ros_texts import registry
 
 ROOT = Path(__file__).resolve().parents[2]
 ROSLIB = ROOT / "web_client" / "node_modules" / "roslib" / "dist" / "RosLib.js"
@@ -41,7 +41,7 @@ def sample(cbor: bytes) -> bytes:
 
 
 def as_roslib_says(kind: Any, value: Any) -> Any:
-    """What the script prints for a value of rclpy, numbers as bits."""
+    """The script's output for a value of rclpy, numbers as bits."""
     if isinstance(kind, idl.NamespacedType):
         return message_as_roslib_says(value)
     if isinstance(kind, idl.Array | idl.AbstractSequence):
@@ -62,7 +62,7 @@ def message_as_roslib_says(message: Any) -> dict[str, Any]:
 
 
 def numbered(kind: Any, value: Any) -> Any:
-    """What the script printed, its numbers as bits."""
+    """The script's output, its numbers as bits."""
     if isinstance(kind, idl.NamespacedType):
         return message_numbered(class_of(kind), value)
     if isinstance(kind, idl.Array | idl.AbstractSequence):
@@ -81,7 +81,7 @@ def message_numbered(cls: Any, value: dict[str, Any]) -> dict[str, Any]:
 
 
 def drawn(name: str) -> list[tuple[Any, bytes]]:
-    """Some messages of this type, and their CBOR."""
+    """Some random messages of this type, and their CBOR."""
     owner, cls = TYPES[name]
     types, found = TypeRegistry(), list[tuple[Any, bytes]]()
     types.add(owner, whole_text(owner))
@@ -96,7 +96,7 @@ def drawn(name: str) -> list[tuple[Any, bytes]]:
 
 
 def test_roslib_reads_every_kind_of_field() -> None:
-    """Every message of the test interfaces and of sensor_msgs is what it was after roslib.js has decoded it."""
+    """Every message of the test interfaces and of sensor_msgs is unchanged after roslib.js has decoded it."""
     sent = [each for name in TYPES for each in drawn(name)]
     lines = b"\n".join(base64.b64encode(sample(cbor)) for _, cbor in sent)
     node = [str(ROOT / "scripts" / "with-node.sh"), "node"]
@@ -129,12 +129,12 @@ def test_roslib_reads_every_kind_of_field() -> None:
     ],
 )
 def test_bytes_of_cbor(text: str, cdr: str, cbor: str) -> None:
-    """Maps, keys, numbers and typed arrays are written so."""
+    """The bytes of maps, keys, numbers and typed arrays."""
     assert registry(B=text).to_cbor("a/msg/B", bytes.fromhex("00010000" + cdr)).hex() == cbor
 
 
 def test_big_endian_numbers_are_turned() -> None:
-    """Typed arrays are little endian, whatever the robot's byte order is."""
+    """Typed arrays are little endian, for any byte order of the robot."""
     types = registry(B="int16[] a\nfloat64[2] b\nuint8[] c")
     cdr = bytes.fromhex("00000000 00000002 0001 fffe 3ff0000000000000 c000000000000000 00000001 07")
     value = cbor2.loads(types.to_cbor("a/msg/B", cdr))
@@ -146,7 +146,7 @@ def test_big_endian_numbers_are_turned() -> None:
 
 
 def test_nan_and_infinity_stay() -> None:
-    """CBOR has them, so nothing is lost."""
+    """CBOR has them, so no value is lost."""
     types = registry(B="float64 a\nfloat32 b\nfloat64[1] c")
     cdr = b"\0\1\0\0" + bytes.fromhex("000000000000f87f 000080ff 00000000 000000000000f07f")
     value = cbor2.loads(types.to_cbor("a/msg/B", cdr))
@@ -158,8 +158,8 @@ def test_nan_and_infinity_stay() -> None:
 @pytest.mark.parametrize(
     "cdr", [b"", b"\0\1\0", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\xff", b"\1\1\0\0\0\0\0\0"]
 )
-def test_bad_messages_are_told_as_for_json(cdr: bytes) -> None:
-    """The same bytes are refused, with the same words."""
+def test_bad_messages_are_reported_as_for_json(cdr: bytes) -> None:
+    """The same bytes are refused, with the same error."""
     types = registry(B="string x")
     with pytest.raises(Invalid) as cbor:
         types.to_cbor("a/msg/B", cdr)

@@ -1,10 +1,11 @@
-"""Code generated for a type: it agrees with the closures on everything, and no definition gets into it."""
+"""Code generated for a type: it agrees with the closures, and contains no text of a definition."""
 
 from __future__ import annotations
 
 import json
 import keyword
 import math
+import re
 import struct
 import time
 import tracemalloc
@@ -15,13 +16,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_protocol import jsontext
+from relay_protocol import jsontext, nonfinite
 from relay_protocol.errors import Invalid
-from relay_protocol.ros import fast_reader, fast_writer
-from relay_protocol.ros.codegen import MAX_STEPS, Source, TooLarge, quoted
-from relay_protocol.ros.compiled import Compiled
+from relay_protocol.ros import generated_cdr_to_json, generated_json_to_cdr
+from relay_protocol.ros.codegen import MAX_STEPS, FunctionBuilder, TooLarge, quoted
+from relay_protocol.ros.compiled import CompiledTypes
 from relay_protocol.ros_types import TypeRegistry
-from tests.protocol.ros_texts import LINE
+from tests.worlds.ros_texts import LINE
 
 EVERYTHING = f"""std_msgs/Header header
 bool flag
@@ -68,7 +69,7 @@ builtin_interfaces/Time stamp
 string frame_id
 """
 TYPE = "a/msg/B"
-COMPILED = Compiled(TYPE, EVERYTHING)
+COMPILED = CompiledTypes(TYPE, EVERYTHING)
 FULL = {
     "header": {"stamp": {"sec": -1, "nanosec": 7}, "frame_id": "map"},
     "flag": True, "i8": -128, "u16": 65535, "i64": -(2**63), "f32": 0.5, "f64": -1e300, "text": "größer 😀",
@@ -103,11 +104,11 @@ class Passed(Exception):
 
 
 def passed(*arguments: Any) -> bytes:
-    """Stands for the closures."""
+    """Replaces the closures."""
     raise Passed
 
 
-PLAIN_COMPILED = Compiled("a/msg/P", PLAIN)
+PLAIN_COMPILED = CompiledTypes("a/msg/P", PLAIN)
 PLAIN_CDR = PLAIN_COMPILED.writer("a/msg/P", False)(
     json.dumps(
         {name: FULL[name] for name in ("header", "text", "texts", "inners", "points", "last")}
@@ -117,24 +118,27 @@ PLAIN_CDR = PLAIN_COMPILED.writer("a/msg/P", False)(
 )
 
 
-PLAIN_FAST = fast_reader.generate("a/msg/P", PLAIN_COMPILED.definitions, "json", passed)
+PLAIN_FAST = generated_cdr_to_json.generate("a/msg/P", PLAIN_COMPILED.definitions, "json", passed)
 
 
 def outcome(convert: Any, *arguments: Any) -> Any:
-    """What comes of a conversion: bytes, or the sentence of the error."""
+    """The result of a conversion: bytes, or the error's text."""
     try:
         return convert(*arguments)
     except Invalid as error:
         return str(error)
 
 
-FAST = {form: fast_reader.generate(TYPE, COMPILED.definitions, form, passed) for form in ("json", "cbor")}
-FAST_WRITE = fast_writer.generate(TYPE, COMPILED.definitions)(passed)
+FAST = {
+    form: generated_cdr_to_json.generate(TYPE, COMPILED.definitions, form, passed)
+    for form in ("json", "cbor")
+}
+FAST_WRITE = generated_json_to_cdr.generate(TYPE, COMPILED.definitions)(passed)
 SLOW_WRITE = COMPILED._slow_writer(TYPE, jsontext.decode_any)
 
 
 def same(one: Any, other: Any) -> bool:
-    """Equality in which NaN equals NaN, and single precision is what it is in decimal."""
+    """Equality in which NaN equals NaN, and single precision is compared by its decimal form."""
     if isinstance(one, dict):
         return list(one) == list(other) and all(same(one[name], other[name]) for name in one)
     if isinstance(one, list | tuple):
@@ -149,15 +153,15 @@ def same(one: Any, other: Any) -> bool:
 
 
 def damaged(data: bytes, draw: Any) -> bytes:
-    """Bytes with one stretch replaced, or cut off."""
+    """Bytes with one part replaced, or cut off."""
     place = draw(st.integers(0, len(data)))
     gone = draw(st.sampled_from([0, 1, 4, 8, len(data)]))
     put = draw(st.binary(max_size=9) | st.sampled_from([b"\0", b"\xff" * 4, b"\1\0\0\0", b"\0\0\0\0"]))
     return data[:place] + put + data[place + gone :]
 
 
-def read_alike(compiled: Compiled, name: str, form: str, cdr: bytes) -> None:
-    """Generated code gives what the closures give, or leaves the message to them."""
+def read_alike(compiled: CompiledTypes, name: str, form: str, cdr: bytes) -> None:
+    """Generated code gives the closures' result, or leaves the message to them."""
     fast = FAST[form] if compiled is COMPILED else PLAIN_FAST
     slow = outcome(compiled._slow_reader(name, form), cdr)
     decode = json.loads if form == "json" else cbor2.loads
@@ -171,7 +175,7 @@ def read_alike(compiled: Compiled, name: str, form: str, cdr: bytes) -> None:
 
 @given(st.data())
 def test_damaged_messages_are_read_alike(data: st.DataObject) -> None:
-    """Whatever generated code reads, the closures read just so; what they refuse it does not read."""
+    """Generated code reads exactly what the closures read, or leaves it to them."""
     cdr = damaged(CDR, data.draw)
     read_alike(COMPILED, TYPE, "json", cdr)
     read_alike(COMPILED, TYPE, "cbor", cdr)
@@ -192,7 +196,7 @@ TOKENS = [
 
 @given(st.data())
 def test_damaged_texts_are_written_alike(data: st.DataObject) -> None:
-    """Whatever text generated code writes, the strict closures write just so; what they refuse it does not write."""
+    """Generated code writes exactly what the strict closures write, or leaves it to them."""
     places = [place for place, byte in enumerate(TEXT) if byte in b'{}[]:,"0123456789']
     place, token = (
         data.draw(st.sampled_from(places)),
@@ -210,7 +214,7 @@ def test_damaged_texts_are_written_alike(data: st.DataObject) -> None:
 
 @given(st.data())
 def test_values_of_any_type_are_written_alike(data: st.DataObject) -> None:
-    """The same with one value replaced by another of any type, and with fields left out."""
+    """The same with one value replaced by another of any type, and with missing fields."""
     value = data.draw(
         st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
         | st.text(max_size=5) | st.lists(st.integers(0, 300) | st.none() | st.text(max_size=2), max_size=3)
@@ -228,8 +232,8 @@ def test_values_of_any_type_are_written_alike(data: st.DataObject) -> None:
             continue
 
 
-def test_what_is_usual_needs_no_closures() -> None:
-    """Full and partial messages are converted by generated code alone."""
+def test_usual_values_need_no_closures() -> None:
+    """Generated code converts full and partial messages alone."""
     assert same(json.loads(FAST["json"](CDR)), FULL)
     assert PLAIN_FAST(PLAIN_CDR)
     assert FAST_WRITE(TEXT, 0) == CDR
@@ -257,11 +261,11 @@ HARMLESS += [
     "v1",
     "f0",
     "f1",
-    "Unusual",
-    "SURPRISES",
+    "UseSlowPath",
+    "SLOW_PATH_ERRORS",
     "convert",
     "eval",
-    "room",
+    "elements_left",
     "self",
     "globals",
     "class_",
@@ -270,7 +274,7 @@ HARMLESS += [
 
 @pytest.mark.parametrize("name", sorted(name for name in HARMLESS if name[0] != "_"))
 def test_fields_may_have_any_name(name: str) -> None:
-    """Keywords, builtins and the names generated code itself uses are names like others."""
+    """Keywords, builtins and the names in generated code itself are allowed."""
     types = TypeRegistry()
     types.add(
         TYPE, f"float64 {name}\nstring[] s{name}\nInner[] i{name}\n{LINE}\nMSG: a/Inner\nstring {name}\n"
@@ -288,9 +292,9 @@ def test_fields_may_have_any_name(name: str) -> None:
     ],
 )  # fmt: skip
 def test_other_names_are_refused(name: str) -> None:
-    """What is no identifier never becomes a field; and if it did, no code would be made with it."""
+    """A name that is no identifier is refused as a field; otherwise no code would be generated."""
     with pytest.raises(Invalid):
-        Compiled(TYPE, f"float64 {name}")
+        CompiledTypes(TYPE, f"float64 {name}")
     with pytest.raises(TooLarge):
         quoted(name)
 
@@ -299,7 +303,7 @@ def test_other_names_are_refused(name: str) -> None:
     "text", ['\'"""\'', '"\\"); import os; (\\""', "'a\\\\'", "\"'''\"", '"{0}%s\\n"', "x\x85y"]
 )
 def test_texts_of_defaults_and_constants_are_values_only(text: str) -> None:
-    """Quotes, backslashes and newlines in them mean nothing to generated code."""
+    """Quotes, backslashes and newlines in them have no effect in generated code."""
     types = TypeRegistry()
     types.add(TYPE, f"string a {text}\nstring A={text}\nstring[] b [{text}, 'x']\nint8 c")
     value = json.loads(types.to_json(TYPE, types.from_json(TYPE, b'{"c":1}', 0)))
@@ -309,7 +313,7 @@ def test_texts_of_defaults_and_constants_are_values_only(text: str) -> None:
 
 
 def many_fields(count: int) -> str:
-    """A definition of so many texts."""
+    """A definition with this many strings."""
     return "\n".join(f"string f{index}" for index in range(count))
 
 
@@ -340,11 +344,11 @@ def nested(depth: int, sequences: bool) -> str:
     ],
 )  # fmt: skip
 def test_large_types_are_left_to_the_closures(text: str, large: bool) -> None:
-    """No definition makes much code; the messages are converted all the same."""
-    compiled = Compiled(TYPE, text)
+    """No definition makes much code; its messages are still converted."""
+    compiled = CompiledTypes(TYPE, text)
     began = time.thread_time()
     slow = compiled._slow_reader(TYPE, "json")
-    assert (fast_reader.generate(TYPE, compiled.definitions, "json", slow) is slow) == large
+    assert (generated_cdr_to_json.generate(TYPE, compiled.definitions, "json", slow) is slow) == large
     assert time.thread_time() - began < 5
     types = TypeRegistry()
     types.add(TYPE, text)
@@ -355,20 +359,20 @@ def test_large_types_are_left_to_the_closures(text: str, large: bool) -> None:
 
 
 def test_deep_texts_are_refused_by_generated_code_too() -> None:
-    """JSON nests at most 64 deep, whatever the type would take."""
+    """JSON nests at most 64 deep, for any type."""
     deepest = 0
     for depth in range(1, 33):
-        compiled = Compiled(TYPE, nested(depth, sequences=True))
-        if fast_writer.generate(TYPE, compiled.definitions)(passed) is not passed:
+        compiled = CompiledTypes(TYPE, nested(depth, sequences=True))
+        if generated_json_to_cdr.generate(TYPE, compiled.definitions)(passed) is not passed:
             deepest = depth
     assert 2 * (deepest + 1) < 64
 
 
 @pytest.mark.parametrize("fields", [many_fields(300), "float64[100] a"])
 def test_short_texts_can_not_become_much_memory(fields: str) -> None:
-    """A megabyte of ``{}``, each of which stands for many fields or numbers, is soon left to the closures."""
-    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\n{fields}")
-    write = fast_writer.generate(TYPE, compiled.definitions)(passed)
+    """A megabyte of ``{}``, each standing for many fields or numbers, is soon left to the closures."""
+    compiled = CompiledTypes(TYPE, f"T[] t\n{LINE}\nMSG: a/T\n{fields}")
+    write = generated_json_to_cdr.generate(TYPE, compiled.definitions)(passed)
     assert write(b'{"t":[{},{}]}', 0)
     text = b'{"t":[' + b",".join([b"{}"] * 300_000) + b"]}"
     tracemalloc.start()
@@ -381,16 +385,16 @@ def test_short_texts_can_not_become_much_memory(fields: str) -> None:
 
 
 def test_decoded_values_of_repeating_types_are_left_to_the_closures() -> None:
-    """How much memory they would take can't be told from their length."""
-    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\nint8 x")
+    """Their memory cannot be derived from their length."""
+    compiled = CompiledTypes(TYPE, f"T[] t\n{LINE}\nMSG: a/T\nint8 x")
     with pytest.raises(Passed):
-        fast_writer.generate(TYPE, compiled.definitions)(passed)({"t": [{}]}, 0)
+        generated_json_to_cdr.generate(TYPE, compiled.definitions)(passed)({"t": [{}]}, 0)
 
 
 @pytest.mark.parametrize("text", ["Point[5] a", "Point[] a"])
 @pytest.mark.parametrize("form", ["json", "cbor"])
 def test_elements_that_are_cut_off_are_missed(text: str, form: str) -> None:
-    """A message that lacks whole elements at its end is not read as one that has fewer."""
+    """A message that lacks whole elements at its end is not read as a shorter one."""
     types = TypeRegistry()
     types.add(TYPE, f"{text}\n{LINE}\nMSG: a/Point\nfloat64 x\nfloat64 y")
     cdr = types.from_json(TYPE, {"a": [{}] * 5}, 0)
@@ -410,17 +414,17 @@ def test_elements_that_are_cut_off_are_missed(text: str, form: str) -> None:
     ],
 )
 def test_a_time_of_the_robots_own_making_breaks_nothing(time: str) -> None:
-    """A header whose stamp is no time is written, or refused, by the closures."""
+    """The closures write or refuse a header whose stamp has another type."""
     text = f"std_msgs/Header h\n{LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\n"
     text += f"{LINE}\nMSG: builtin_interfaces/Time\n{time}\n{LINE}\nMSG: builtin_interfaces/T\nint8 x"
-    compiled = Compiled(TYPE, text)
+    compiled = CompiledTypes(TYPE, text)
     slow = compiled._slow_writer(TYPE, json.loads)
     assert outcome(compiled.writer(TYPE, False), b"{}", 5) == outcome(slow, b"{}", 5)
 
 
 def test_lines_of_a_source_are_the_only_code() -> None:
-    """Objects are handed over by name and never written into the text."""
-    source = Source()
+    """Objects are passed by name and never written into the text."""
+    source = FunctionBuilder()
     name = source.constant("'); raise SystemExit('")
     source.line(f"return {name}.encode()")
     assert source.function("data")(passed)(b"") == b"'); raise SystemExit('"
@@ -441,3 +445,76 @@ def test_numbers_of_cbor_are_exact() -> None:
         back = list(cbor2.loads(types.to_cbor(TYPE, cdr)).values())
         assert back[:8] == values
         assert same(back[8:], [real, real, low])
+
+
+CHECKED = f"""std_msgs/Header header
+bool flag
+int8 small
+uint64 large
+float32 single
+float64 double
+string text
+string<=4 short
+Inner inner
+{LINE}
+MSG: a/Inner
+uint8 tag
+string name
+{LINE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+CHECKED_TYPES = CompiledTypes("a/msg/C", CHECKED)
+SCALARS = (
+    st.integers(-(2**65), 2**65)
+    | st.integers(-200, 300)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=6)
+    | st.sampled_from([None, True, "\0", "a\0b", "ä" * 3, 1e39, 3.5e38, 2.0, "\ud800", "\0NaN", [], {}])
+)
+CHECKED_FIELDS = ["header", "flag", "small", "large", "single", "double", "text", "short", "inner", "other"]
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(CHECKED_FIELDS),
+        SCALARS
+        | st.dictionaries(st.sampled_from(["tag", "name", "frame_id", "stamp"]), SCALARS, max_size=2)
+        | st.fixed_dictionaries({"stamp": st.fixed_dictionaries({"sec": SCALARS, "nanosec": SCALARS})}),
+        max_size=4,
+    )
+)
+def test_a_check_takes_what_a_writer_takes(value: dict[str, Any]) -> None:
+    """It returns the text without marks, and refuses the others with the same error."""
+    text = json.dumps(value).encode()
+    try:
+        CHECKED_TYPES.writer("a/msg/C", True)(text)
+    except Invalid as error:
+        with pytest.raises(Invalid, match=f"^{re.escape(str(error))}$"):
+            CHECKED_TYPES.check("a/msg/C")(text)
+    else:
+        assert CHECKED_TYPES.check("a/msg/C")(text) == nonfinite.marks_to_null(text)
+
+
+def test_types_with_arrays_are_checked_by_writing() -> None:
+    check = PLAIN_COMPILED.check("a/msg/P")
+    check(b'{"pair":[1,2]}')
+    with pytest.raises(Invalid, match="pair"):
+        check(b'{"pair":[1,2,3]}')
+    assert generated_json_to_cdr.generate_check("a/msg/P", PLAIN_COMPILED.definitions) is None
+
+
+def test_check_without_changes_writes_nothing() -> None:
+    make = generated_json_to_cdr.generate_check("a/msg/C", CHECKED_TYPES.definitions)
+    assert make is not None
+    make(passed)(b'{"small":1,"text":"x","short":"abcd","header":{},"inner":{"tag":255}}')
+    for text in (b'{"small":128}', b'{"text":"\\u0000"}', b'{"short":"abcde"}', b'{"single":1e39}'):
+        with pytest.raises(Passed):
+            make(passed)(text)
+
+
+def test_only_types_with_a_header_need_the_time() -> None:
+    assert CHECKED_TYPES.is_stamped("a/msg/C")
+    assert not CHECKED_TYPES.is_stamped("a/msg/Inner")
+    assert CHECKED_TYPES.is_stamped("std_msgs/msg/Header")

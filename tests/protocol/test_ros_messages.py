@@ -1,4 +1,4 @@
-"""CDR to JSON and back, for types made up here; the installed ones are compared with rclpy elsewhere."""
+"""CDR to JSON and back, for invented types; other files compare the installed ones with rclpy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol.errors import Invalid
-from tests.protocol.ros_texts import LINE, registry
+from tests.worlds.ros_texts import LINE, registry
 
 HEADER = "builtin_interfaces/Time stamp\nstring frame_id"
 STAMPED = f"std_msgs/Header header\nint8 a\n{LINE}\nMSG: std_msgs/Header\n{HEADER}"
@@ -66,12 +66,12 @@ ALL = registry(B=EVERYTHING)
 
 
 def signed(bits: int) -> st.SearchStrategy[int]:
-    """Integers of so many bits."""
+    """Integers with this many bits."""
     return st.integers(-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
 
 def unsigned(bits: int) -> st.SearchStrategy[int]:
-    """The same without sign."""
+    """Unsigned integers with this many bits."""
     return st.integers(0, 2**bits - 1)
 
 
@@ -104,13 +104,13 @@ MESSAGE = st.fixed_dictionaries(
 
 
 def single(value: float) -> bytes:
-    """Single precision has several spellings: its bits."""
+    """Single precision has several spellings, so its bits are compared."""
     return struct.pack("f", value)
 
 
 @given(MESSAGE)
 def test_every_kind_of_field_survives(message: dict[str, Any]) -> None:
-    """What was written is read again, in both byte orders' alignment."""
+    """Written values are read unchanged, in both byte orders."""
     back = json.loads(ALL.to_json("a/msg/B", ALL.from_json("a/msg/B", message, 0)))
     assert list(map(single, back.pop("singles"))) == list(map(single, message["singles"]))
     assert back == {name: value for name, value in message.items() if name != "singles"}
@@ -118,7 +118,7 @@ def test_every_kind_of_field_survives(message: dict[str, Any]) -> None:
 
 @given(MESSAGE, st.data())
 def test_a_cut_message_is_invalid(message: dict[str, Any], data: st.DataObject) -> None:
-    """A message that ends early is an error at every length, because its last field is a number."""
+    """A truncated message is an error at every length, because its last field is a number."""
     cdr = ALL.from_json("a/msg/B", message, 0)
     with pytest.raises(Invalid, match="a/msg/B: "):
         ALL.to_json("a/msg/B", cdr[: data.draw(st.integers(0, len(cdr) - 1))])
@@ -149,7 +149,7 @@ def test_a_flipped_byte_raises_nothing_but_invalid(message: dict[str, Any], plac
 )
 @pytest.mark.parametrize("head", [b"\0\0\0\0", b"\0\1\0\0"])
 def test_a_huge_length_costs_nothing(text: str, head: bytes) -> None:
-    """A length of 2^32-1 is refused without any memory being taken for it."""
+    """A length of 2^32-1 is refused without allocating memory."""
     types = registry(B=f"{text}\n{LINE}\nMSG: a/Inner\nint64 y\n{LINE}\nMSG: a/E\n")
     types.zero("a/msg/B")
     tracemalloc.start()
@@ -163,7 +163,7 @@ def test_a_huge_length_costs_nothing(text: str, head: bytes) -> None:
 
 @pytest.mark.parametrize("text", ["E[] x", "string[] x", "F[] x"])
 def test_small_bytes_can_not_become_a_million_objects(text: str) -> None:
-    """A robot that sends 16 MiB of tiny messages does not cost the relay gigabytes, nested or not."""
+    """16 MiB of tiny messages do not cost the relay gigabytes, nested or not."""
     contained = f"{LINE}\nMSG: a/E\n{LINE}\nMSG: a/F\nE[] e"
     types = registry(B=f"{text}\n{contained}")
     one = {"E": struct.pack("<I", 0), "s": struct.pack("<I", 0), "F": struct.pack("<I", 60) + bytes(60)}[
@@ -180,7 +180,7 @@ def test_small_bytes_can_not_become_a_million_objects(text: str) -> None:
 
 
 def test_few_bytes_of_json_can_not_become_a_huge_message() -> None:
-    """A list of empty objects stands for defaults, whose size is bounded."""
+    """A list of empty objects stands for defaults, whose size is limited."""
     types = registry(B=f"E[] x\n{LINE}\nMSG: a/E\nfloat64[100000] e", C="float64[] x")
     with pytest.raises(Invalid, match="x makes a message of more than 16777216 bytes"):
         types.from_json("a/msg/B", {"x": [{}] * 300_000}, 0)
@@ -190,7 +190,7 @@ def test_few_bytes_of_json_can_not_become_a_huge_message() -> None:
 
 
 def test_big_endian_is_read() -> None:
-    """Robots of the other byte order are understood, numbers, arrays and lengths alike."""
+    """Numbers, arrays and lengths of robots with the other byte order."""
     types = registry(B="int16 a\nfloat64[] b\nwstring c\nuint8[] d\nint64[2] e")
     body = struct.pack(">h2xI d II I3sx 2q", -2, 1, 1.5, 1, 0xDF, 3, b"abc", 5, -6)
     value = json.loads(types.to_json("a/msg/B", b"\0\0\0\0" + body))
@@ -198,7 +198,7 @@ def test_big_endian_is_read() -> None:
 
 
 def test_numbers_json_lacks_become_null_and_null_becomes_nan() -> None:
-    """NaN and infinity have no JSON; a null in a float is NaN."""
+    """JSON has no NaN and infinity; a null in a float is NaN."""
     types = registry(B="float64 a\nfloat32[] b\nfloat64[2] c")
     cdr = b"\0\1\0\0" + struct.pack("<dI2f4x2d", math.nan, 2, math.inf, 1, -math.inf, 2)
     assert types.to_json("a/msg/B", cdr) == b'{"a":null,"b":[null,1.0],"c":[null,2.0]}'
@@ -208,7 +208,7 @@ def test_numbers_json_lacks_become_null_and_null_becomes_nan() -> None:
 
 
 def test_strings_that_are_no_utf8_are_shown_with_marks() -> None:
-    """One careless node does not hide a whole message."""
+    """One faulty node does not hide a whole message."""
     types = registry(B="string a\nstring b")
     cdr = b"\0\1\0\0" + struct.pack("<I3sxI", 3, b"\xffa\0", 0)
     assert json.loads(types.to_json("a/msg/B", cdr)) == {"a": "\ufffda", "b": ""}
@@ -222,7 +222,7 @@ def test_other_encodings_are_refused(head: bytes) -> None:
 
 
 def test_defaults_of_the_definition_are_used() -> None:
-    """A field nobody sets has the value its text gives it."""
+    """A missing field has the default of the definition."""
     text = "float64 w 1.0\nint8[] l [1, 2]\nstring s 'x'\nuint8[2] b [7, 8]\nfloat32[3] z\n"
     text += "wstring u ß\nbool t true"
     value = json.loads(registry(B=text).to_json("a/msg/B", registry(B=text).zero("a/msg/B")))
@@ -270,8 +270,8 @@ def test_defaults_of_the_definition_are_used() -> None:
         ("f64", "NaN", "not JSON"),
     ],
 )
-def test_what_does_not_fit_is_named(field: str, value: str, problem: str) -> None:
-    """The error gives the type, the path and what is wrong, and is one short sentence."""
+def test_mismatched_field_is_named(field: str, value: str, problem: str) -> None:
+    """The error has the type, the path and the reason in one short sentence."""
     with pytest.raises(Invalid) as caught:
         ALL.from_json("a/msg/B", f'{{"{field}": {value}}}'.encode(), 0)
     assert str(caught.value).startswith("a/msg/B: ")
@@ -281,7 +281,7 @@ def test_what_does_not_fit_is_named(field: str, value: str, problem: str) -> Non
 
 @pytest.mark.parametrize("body", [b"[]", b"1", b"null", b'"x"', b"", b"{", b"\xff"])
 def test_a_message_is_an_object(body: bytes) -> None:
-    """Anything else is refused."""
+    """Other values are refused."""
     with pytest.raises(Invalid, match="a/msg/B"):
         ALL.from_json("a/msg/B", body, 0)
 
@@ -293,7 +293,7 @@ def test_a_message_is_an_object(body: bytes) -> None:
     )
 )
 def test_any_value_in_any_field_raises_nothing_but_invalid(value: Any) -> None:
-    """Clients can put what they like where they like."""
+    """For any value in any place."""
     for field in json.loads(ALL.to_json("a/msg/B", ALL.zero("a/msg/B"))):
         for wrapped in (value, {"value": value}, [{"name": value}]):
             try:
@@ -318,7 +318,7 @@ NOW = 1_700_000_000_123_456_789
 
 @pytest.mark.parametrize("body", [{}, {"header": {}}, {"header": {"frame_id": "map"}}])
 def test_a_header_without_stamp_gets_the_present_time(body: dict[str, Any]) -> None:
-    """So clients need no clock."""
+    """Clients need no clock."""
     types = registry(B=STAMPED)
     value = json.loads(types.to_json("a/msg/B", types.from_json("a/msg/B", body, NOW)))
     assert value["header"]["stamp"] == {"sec": 1_700_000_000, "nanosec": 123_456_789}
@@ -328,7 +328,7 @@ def test_a_header_without_stamp_gets_the_present_time(body: dict[str, Any]) -> N
     "stamp", [{"sec": 5, "nanosec": 6}, {"secs": 5, "nsecs": 6}, {"secs": 5, "nanosec": 6}]
 )
 def test_a_stamp_that_is_given_stays(stamp: dict[str, int]) -> None:
-    """In the words of ROS 2 or of ROS 1."""
+    """In the form of ROS 2 or of ROS 1."""
     types = registry(B=STAMPED)
     value = json.loads(
         types.to_json("a/msg/B", types.from_json("a/msg/B", {"header": {"stamp": stamp}}, NOW))
@@ -358,14 +358,14 @@ def test_zero_has_no_time() -> None:
         5,
     ],
 )
-def test_a_writer_raises_invalid_for_whatever_is_no_message(checked: bool, body: Any) -> None:
+def test_a_writer_raises_invalid_for_everything_but_messages(checked: bool, body: Any) -> None:
     """Texts and values, checked before or not."""
     with pytest.raises(Invalid, match="a/msg/B"):
         registry(B="string a").writer("a/msg/B", checked)(body, 0)
 
 
 def test_a_writer_is_strict_unless_the_text_was_checked() -> None:
-    """Where the closures decode, an unchecked text is looked at as a whole."""
+    """If the closures decode it, an unchecked text is checked as a whole."""
     types = registry(B="string a", C="\n".join(f"string f{number}" for number in range(1000)))
     deep = b'{"a":' + b"[" * 70 + b"]" * 70 + b"}"
     for name in ("a/msg/B", "a/msg/C"):

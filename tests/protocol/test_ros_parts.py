@@ -1,4 +1,4 @@
-"""Services and actions: each part of them is a message, and arguments come in many ways."""
+"""Services and actions: each of their parts is a message, and arguments have several forms."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pytest
 
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.ros_types import TypeRegistry
-from tests.protocol.ros_texts import LINE
+from tests.worlds.ros_texts import LINE
 
 TRIGGER = "---\nbool success\nstring message"
 
 
 def test_service_arguments_come_by_name_by_order_or_not_at_all() -> None:
-    """A request is an object, a list, null or nothing."""
+    """A request is an object, a list, null or missing."""
     types = TypeRegistry()
     types.add("a/srv/Add", "int32 a\nint32 b\n---\nint32 sum")
     wanted = b"\0\1\0\0" + struct.pack("<ii", 3, 4)
@@ -43,7 +43,7 @@ ACTION += f"{LINE}\nMSG: a/Inner\nfloat64 x\n"
 
 
 def test_the_parts_of_an_action_are_messages() -> None:
-    """Goal, result and feedback are converted both ways under names of their own."""
+    """Goal, result and feedback have type names of their own and are converted in both directions."""
     types = TypeRegistry()
     types.add("a/action/Count", ACTION)
     goal = b'{"order":5,"inners":[{"x":1.5}]}'
@@ -60,7 +60,7 @@ def test_the_parts_of_an_action_are_messages() -> None:
 
 
 def test_goals_come_by_name_by_order_or_not_at_all() -> None:
-    """The arguments of an action are given like those of a service."""
+    """Arguments of an action have the forms of a service's."""
     types = TypeRegistry()
     types.add("a/action/Count", ACTION)
     wanted = types.from_json("a/action/Count_Goal", {"order": 5, "inners": [{"x": 2.0}]}, 0)
@@ -74,7 +74,7 @@ def test_goals_come_by_name_by_order_or_not_at_all() -> None:
 
 
 def test_typedefs_of_the_parts_of_actions_and_services() -> None:
-    """Each part is a type of its own to rosapi, with what it contains behind it."""
+    """Each part is a type of rosapi, followed by its nested types."""
     types = TypeRegistry()
     types.add("a/action/Count", ACTION)
     types.add("std_srvs/srv/Trigger", TRIGGER)

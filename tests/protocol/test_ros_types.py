@@ -1,4 +1,4 @@
-"""What is known of a robot's types: by which names, how many, until when."""
+"""The registry of a robot's types: names, limits and lifetime."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import pytest
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.limits import TYPE_DEFINITION
 from relay_protocol.ros_types import TypeRegistry
-from tests.protocol.ros_texts import LINE, registry
+from tests.worlds.ros_texts import LINE, registry
 
 VECTOR = "float64 x\nfloat64 y\nfloat64 z"
 TWIST = f"Vector3 linear\nVector3 angular\n{LINE}\nMSG: geometry_msgs/Vector3\n{VECTOR}"
 
 
 def test_readers_and_writers_are_kept_until_the_type_changes() -> None:
-    """They are made once, for like robots together; another definition brings others, the old stay what they were."""
+    """They are made once and shared by equal robots; another definition makes new ones, and the old ones stay
+    unchanged.
+    """
     types, other = registry(B="int8 a"), registry(B="int8 a")
     read, write = types.reader("a/msg/B", "json"), types.writer("a/B", checked=True)
     assert types.reader("a/B", "json") is read is other.reader("a/msg/B", "json")
@@ -30,7 +32,7 @@ def test_readers_and_writers_are_kept_until_the_type_changes() -> None:
     "ask", [lambda types: types.reader("a/msg/X", "cbor"), lambda types: types.writer("a/msg/X")]
 )
 def test_there_is_no_reader_or_writer_of_an_unknown_type(ask: Any) -> None:
-    """Asking for one is NotFound, not the first message."""
+    """The request raises NotFound, before the first message."""
     with pytest.raises(NotFound, match="the definition of a/msg/X is not known"):
         ask(registry(B="int8 a"))
 
@@ -46,7 +48,7 @@ def test_names_may_be_short() -> None:
 
 
 def test_contained_types_are_known_too() -> None:
-    """A text teaches all the types in it."""
+    """A text defines all types in it."""
     types = TypeRegistry()
     types.add("geometry_msgs/msg/Twist", TWIST)
     assert types.knows("geometry_msgs/msg/Vector3")
@@ -56,8 +58,8 @@ def test_contained_types_are_known_too() -> None:
     )
 
 
-def test_unknown_types_are_told() -> None:
-    """Asking for one is NotFound; whether it is known is a plain no, even for nonsense."""
+def test_unknown_types_are_reported() -> None:
+    """A request raises NotFound; the check whether it is known is false, for invalid names too."""
     types = TypeRegistry()
     assert not types.knows("a/msg/B")
     assert not types.knows("nonsense")
@@ -67,7 +69,7 @@ def test_unknown_types_are_told() -> None:
 
 
 def test_a_new_text_replaces_the_former_and_the_same_changes_nothing() -> None:
-    """A robot that was updated sends another text; registries don't disturb each other."""
+    """An updated robot sends another text; registries are independent."""
     types, other = registry(B="int8 a"), registry(B="int8 a")
     types.add("a/msg/B", "int8 a")
     types.add("a/msg/B", "int16 b")
@@ -76,7 +78,7 @@ def test_a_new_text_replaces_the_former_and_the_same_changes_nothing() -> None:
 
 
 def test_a_bad_text_leaves_what_was_known() -> None:
-    """An error registers nothing and takes nothing away."""
+    """An error neither adds nor removes types."""
     types = registry(B="int8 a")
     with pytest.raises(Invalid):
         types.add("a/msg/B", "nonsense")
@@ -84,7 +86,7 @@ def test_a_bad_text_leaves_what_was_known() -> None:
 
 
 def test_the_number_of_types_is_bounded() -> None:
-    """A robot can't fill the relay's memory with types."""
+    """Types of a robot cannot fill the relay's memory."""
     types = TypeRegistry()
     for number in range(4096):
         types.add(f"a/msg/T{number}", "int8 a")
@@ -94,7 +96,7 @@ def test_the_number_of_types_is_bounded() -> None:
 
 
 def test_the_texts_of_all_types_together_are_bounded() -> None:
-    """A robot can't fill the relay's memory with comments; a text that replaces another takes its place."""
+    """Comments cannot fill the relay's memory; a text that replaces another takes its place."""
     types = TypeRegistry()
     comment = "#" * (TYPE_DEFINITION - 10)
     for number in range(64):
@@ -107,7 +109,7 @@ def test_the_texts_of_all_types_together_are_bounded() -> None:
 
 
 def test_typedefs_list_every_type_once() -> None:
-    """rosapi's form: the type asked for first, then all it contains."""
+    """In rosapi's form: the requested type first, then all nested ones."""
     text = "Vector3[2] a\nVector3[] b\nint8 A=1\nuint8[<=5] c\nstring d 'x'\n"
     text += f"{LINE}\nMSG: geometry_msgs/Vector3\n{VECTOR}"
     types = TypeRegistry()
@@ -126,7 +128,7 @@ def test_typedefs_list_every_type_once() -> None:
 
 
 def test_a_whole_text_holds_what_the_type_contains_and_nothing_else() -> None:
-    """Also if it came as a part of another's, and with the built-in types that a robot may leave out."""
+    """Also for a type from another's text, and with built-in types that a robot may leave out."""
     types = TypeRegistry()
     text = f"# a comment\nTwist twist\nbuiltin_interfaces/Time at\n{LINE}\nMSG: geometry_msgs/msg/Twist\n{TWIST}\n"
     types.add("geometry_msgs/msg/Timed", text)

@@ -22,14 +22,14 @@ def test_a_publish_keeps_its_body_undecoded() -> None:
 
 @pytest.mark.parametrize(("text", "wanted"), [('"a"', "a"), ("7", 7), ("null", None)])
 def test_ids_are_strings_numbers_or_none(text: str, wanted: object) -> None:
-    """Clients that number their calls are understood."""
+    """Clients may number their calls."""
     message = rosbridge.decode(f'{{"op":"unsubscribe","topic":"/a","id":{text}}}'.encode())
     assert isinstance(message, rosbridge.Unsubscribe)
     assert message.id == wanted
 
 
 def test_arguments_may_be_a_list_or_an_object() -> None:
-    """Both of rosbridge's forms pass to the type's judge undecoded."""
+    """Both of rosbridge's forms are passed on undecoded."""
     for args in (b"[1,2]", b'{"a":1}'):
         message = rosbridge.decode(b'{"op":"call_service","service":"/s","args":' + args + b"}")
         assert isinstance(message, rosbridge.CallService)
@@ -37,8 +37,8 @@ def test_arguments_may_be_a_list_or_an_object() -> None:
         assert bytes(message.args) == args
 
 
-def test_absent_arguments_are_told_from_null() -> None:
-    """No arguments are falsy; null is a text like any other."""
+def test_absent_arguments_are_distinguished_from_null() -> None:
+    """Missing arguments are falsy; null is a text like any other."""
     absent = rosbridge.decode(b'{"op":"call_service","service":"/s"}')
     null = rosbridge.decode(b'{"op":"call_service","service":"/s","args":null}')
     assert isinstance(absent, rosbridge.CallService)
@@ -62,12 +62,12 @@ def test_absent_arguments_are_told_from_null() -> None:
     ],
 )  # fmt: skip
 def test_a_field_that_is_null_counts_as_left_out(text: str, plain: object) -> None:
-    """Many JSON libraries write out what was left open; such a call must not be lost."""
+    """Many JSON libraries write unset fields as null; such a call must not be lost."""
     assert rosbridge.decode(text.encode()) == plain
 
 
 def test_a_null_beside_other_fields_keeps_the_body_as_it_came() -> None:
-    """The body is the client's own text still, and a null body stays one."""
+    """The body is still the client's own text, and a null body stays one."""
     message = rosbridge.decode(b'{"op":"publish","topic":"/a","latch":null,"msg":{"x" : 1.50}}')
     assert isinstance(message, rosbridge.Publish)
     assert bytes(message.msg) == b'{"x" : 1.50}'
@@ -85,7 +85,7 @@ def test_a_null_beside_other_fields_keeps_the_body_as_it_came() -> None:
     ],
 )
 def test_a_null_hides_no_other_fault(text: str) -> None:
-    """What must be there, and what is of a wrong type, is told as ever."""
+    """Missing fields and wrong types are reported as usual."""
     with pytest.raises(MalformedMessage):
         rosbridge.decode(text.encode())
 
@@ -104,20 +104,20 @@ def test_a_null_hides_no_other_fault(text: str) -> None:
     ],
 )  # fmt: skip
 def test_integers_may_be_written_with_a_point(text: str, plain: object) -> None:
-    """Some languages know no other numbers."""
+    """Some languages have no other numbers."""
     assert rosbridge.decode(text.encode()) == plain
 
 
 def test_a_point_beside_other_fields_keeps_the_body_as_it_came() -> None:
-    """Numbers in the body are the type's to judge."""
+    """Numbers in the body are checked by the type."""
     message = rosbridge.decode(b'{"op":"publish","topic":"/a","queue_size":1.0,"msg":{"id" : 2.0}}')
     assert isinstance(message, rosbridge.Publish)
     assert (message.queue_size, bytes(message.msg)) == (1, b'{"id" : 2.0}')
 
 
 @pytest.mark.parametrize("number", ["2.5", "1e300", "-0.5", '"2.0"', "true"])
-def test_what_is_no_integer_is_refused(number: str) -> None:
-    """Nothing is rounded, and no text is taken for a number."""
+def test_non_integer_is_refused(number: str) -> None:
+    """Numbers are not rounded, and a text is not a number."""
     with pytest.raises(MalformedMessage, match="queue_length"):
         rosbridge.decode(f'{{"op":"subscribe","topic":"/a","queue_length":{number}}}'.encode())
 
@@ -141,16 +141,16 @@ def test_what_is_no_integer_is_refused(number: str) -> None:
         ('', None),
     ],
 )  # fmt: skip
-def test_who_waits_for_an_answer_is_seen_in_what_is_malformed(text: str, wanted: object) -> None:
-    """A call or a goal is known by its op, and by its name or its id."""
+def test_pending_request_is_found_in_malformed_bytes(text: str, wanted: object) -> None:
+    """A call or a goal is recognised by its op, with its name or its id."""
     with pytest.raises(MalformedMessage):
         rosbridge.decode(text.encode())
     assert rosbridge.unreadable(text.encode()).request == wanted
 
 
 @pytest.mark.parametrize("args", [b"[" * 200 + b"]" * 200, b'"\xff"'])
-def test_who_waits_is_seen_beside_a_body_that_is_refused(args: bytes) -> None:
-    """Too deep, or no UTF-8: what stands around it can be read all the same."""
+def test_pending_request_is_found_beside_a_refused_body(args: bytes) -> None:
+    """Too deep, or not UTF-8: the other fields can still be read."""
     text = b'{"op":"call_service","id":"1","service":"/s","args":' + args + b"}"
     with pytest.raises(MalformedMessage):
         rosbridge.decode(text)
@@ -158,13 +158,13 @@ def test_who_waits_is_seen_beside_a_body_that_is_refused(args: bytes) -> None:
 
 
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
-def test_nobody_waits_for_an_answer_to_junk(data: bytes) -> None:
-    """No bytes make the look fail."""
+def test_junk_needs_no_answer(data: bytes) -> None:
+    """For any bytes the search does not fail."""
     assert rosbridge.unreadable(data) == (None, None)
 
 
-def test_an_unknown_op_is_told_with_those_known() -> None:
-    """The error names the op and what would have been right."""
+def test_error_for_an_unknown_op_lists_the_known_ones() -> None:
+    """The error has the op and the known ones."""
     with pytest.raises(
         MalformedMessage, match=r"unknown op 'subscrbe'; known are action_feedback, .*unsubscribe"
     ):
@@ -172,21 +172,21 @@ def test_an_unknown_op_is_told_with_those_known() -> None:
 
 
 def test_two_ops_are_refused_as_such() -> None:
-    """A message with op twice is not taken for an unknown one."""
+    """A message with op twice does not count as an unknown one."""
     with pytest.raises(MalformedMessage, match="'op' twice"):
         rosbridge.decode(b'{"op":"subscribe","op":"publish","topic":"/a"}')
 
 
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
 def test_junk_raises_nothing_but_malformed(data: bytes) -> None:
-    """No bytes make the decoder fail otherwise."""
+    """Any bytes are an operation or this error."""
     with pytest.raises(MalformedMessage):
         rosbridge.decode(data)
 
 
 @given(st.text(max_size=20), st.none() | st.integers(-(2**53), 2**53) | st.text(max_size=5), st.booleans())
-def test_what_the_relay_sends_is_json(text: str, ident: rosbridge.Id, result: bool) -> None:
-    """Messages to clients are put together from parts and are whole JSON all the same."""
+def test_relay_sends_json(text: str, ident: rosbridge.Id, result: bool) -> None:
+    """Messages to clients are joined from parts and are valid JSON."""
     publish = json.loads(rosbridge.publish(text, b'{"a":1}'))
     assert publish == {"op": "publish", "topic": text, "msg": {"a": 1}}
     response = json.loads(rosbridge.service_response(text, ident, result, msgspec.json.encode(text)))
@@ -200,7 +200,7 @@ def test_what_the_relay_sends_is_json(text: str, ident: rosbridge.Id, result: bo
 
 @pytest.mark.parametrize("extra", [0, 1, 2, 60])
 def test_objects_in_each_other_are_counted_however_short(extra: int) -> None:
-    """The shortest text of each depth: as deep as allowed is taken, one more is refused."""
+    """The shortest text of each depth: the maximum depth is accepted, one more is refused."""
     inner = limits.JSON_DEPTH - 2 + extra
     text = b'{"op":"publish","topic":"t","msg":' + b'{"":' * inner + b"{}" + b"}" * inner + b"}"
     if extra == 0:

@@ -12,8 +12,8 @@ OWNER = [Grant(Level.OWNER)]
 
 
 def allowed(scope: str, operation: Operation, resource: str, robot: str = "rover") -> bool:
-    """Whether an owner with a token of this scope may."""
-    return Rules(OWNER, Scope(scope).on(robot)).judge(operation, resource).allowed
+    """Whether an owner with a token of this scope may do this."""
+    return Rules(OWNER, Scope(scope).on(robot)).decide(operation, resource).allowed
 
 
 @pytest.mark.parametrize(
@@ -38,16 +38,16 @@ def allowed(scope: str, operation: Operation, resource: str, robot: str = "rover
         ("subscribe:/count*", Operation.SUBSCRIBE, "/count/_action/feedback", True),
     ],
 )
-def test_what_a_scope_covers(scope: str, operation: Operation, resource: str, yes: bool) -> None:
-    """An owner's token opens what its scope names, and nothing else."""
+def test_scope_covers(scope: str, operation: Operation, resource: str, yes: bool) -> None:
+    """An owner's token allows what its scope names, and nothing else."""
     assert allowed(scope, operation, resource) is yes
 
 
 def test_a_scope_gives_no_right() -> None:
-    """Who may only look may do no more with a token for everything."""
+    """A viewer with a token for everything stays a viewer."""
     rules = Rules([Grant(Level.VIEWER, deny=("subscribe:/secret",))], Scope("owner").on("rover"))
-    assert not rules.judge(Operation.PUBLISH, "/cmd_vel").allowed
-    assert not rules.judge(Operation.SUBSCRIBE, "/secret").allowed
+    assert not rules.decide(Operation.PUBLISH, "/cmd_vel").allowed
+    assert not rules.decide(Operation.SUBSCRIBE, "/secret").allowed
     assert rules.level is Level.VIEWER
 
 
@@ -62,16 +62,16 @@ def test_a_scope_gives_no_right() -> None:
     ],
 )
 def test_the_level_one_acts_with(scope: str, level: Level | None) -> None:
-    """It is the lower of the user's and the scope's; a robot the scope does not name is as if there were no right."""
+    """It is the lower of the user's and the scope's; a robot outside the scope has no right."""
     rules = Rules(OWNER, Scope(scope).on("rover"))
     assert rules.level is level
     assert bool(rules) is (level is not None)
 
 
 def test_the_reason_names_the_scope() -> None:
-    """Who is refused for his token's sake is told so."""
-    verdict = Rules(OWNER, Scope("viewer").on("rover")).judge(Operation.CALL, "/dock")
-    assert verdict.reason == "call on /dock is outside the scope of your token"
+    """The error says that the token's scope is the reason."""
+    decision = Rules(OWNER, Scope("viewer").on("rover")).decide(Operation.CALL, "/dock")
+    assert decision.reason == "call on /dock is outside the scope of your token"
 
 
 @pytest.mark.parametrize(
@@ -80,18 +80,18 @@ def test_the_reason_names_the_scope() -> None:
         ("", "one item or more"),
         ("viewer  operator", "one item or more"),
         (" viewer", "one item or more"),
-        ("king", "'king' is no scope"),
+        ("king", "'king' is not a scope"),
         ("viewer@", "names no robot"),
-        ("fly:/away", "is no pattern"),
+        ("fly:/away", "is not a pattern"),
         ("publish:cmd_vel", "must begin with /"),
         ('viewer@"rover"', "printable ASCII"),
         ("viewer@röver", "printable ASCII"),
         ("viewer@" + "r" * 300, "printable ASCII"),
-        (" ".join(f"viewer@r{n}" for n in range(ITEMS + 1)), "may have"),
+        (" ".join(f"viewer@r{n}" for n in range(ITEMS + 1)), "at most"),
     ],
 )
-def test_what_is_no_scope(text: str, words: str) -> None:
-    """It is refused, and the words say why."""
+def test_invalid_scopes(text: str, words: str) -> None:
+    """The error has the reason."""
     with pytest.raises(Invalid, match=words.replace("(", r"\(")):
         Scope(text)
 
@@ -118,16 +118,16 @@ def test_what_is_no_scope(text: str, words: str) -> None:
     ],
 )
 def test_a_narrower_scope(narrow: str, wide: str, yes: bool) -> None:
-    """What one may ask for in exchange for something wider is sure to be covered by that."""
+    """A scope that may be requested in exchange for a wider one is always covered by it."""
     assert Scope(narrow).within(Scope(wide)) is yes
 
 
-def test_an_item_said_twice_is_one() -> None:
-    """A scope is told as it is used."""
+def test_a_repeated_item_counts_once() -> None:
+    """A scope is returned as it is used."""
     assert str(Scope("viewer viewer operator@rover")) == "viewer operator@rover"
 
 
 def test_rules_that_judge_alike_are_known_by_their_key() -> None:
-    """What is kept for a set of rights is not shown to a token of less."""
+    """Caches for a set of rights are not shared with a token of fewer rights."""
     assert Rules(OWNER).key == Rules(OWNER).key
     assert Rules(OWNER).key != Rules(OWNER, Scope("viewer").on("rover")).key

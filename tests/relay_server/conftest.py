@@ -1,8 +1,7 @@
-"""A world in memory, and a relay's database in a file, for the tests of the relay's parts."""
+"""A relay world in memory, and a relay's database in a file, for tests of the relay's parts."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,43 +10,34 @@ from twisted.internet import reactor
 
 from relay_db.engine import Database
 from relay_server.common.database import AsyncDatabase
-from tests.relay_server.front_desk import Desk
-from tests.relay_server.memory import Time, World
+from tests.worlds.empty_database import write_empty_database
+from tests.worlds.relay import Time, World
+from tests.worlds.session_manager import SessionsWorld
 
 
 @pytest.fixture
 def world() -> World:
-    """One robot, offline, and nobody there."""
+    """One offline robot, and no clients."""
     return World()
 
 
 @pytest.fixture
 def time() -> Time:
-    """A thousand seconds after the beginning."""
+    """A clock at 1000 s."""
     return Time()
 
 
-@pytest.fixture(scope="session")
-def upgraded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A SQLite file with all tables, to be copied."""
-    path = tmp_path_factory.mktemp("db") / "switchboard.db"
-    database = Database(f"sqlite:///{path}")
-    database.upgrade()
-    database.close()
-    return path
-
-
 @pytest.fixture
-def database(upgraded: Path, tmp_path: Path) -> Database:
-    """A database of its own; :func:`store` closes it."""
+def database(tmp_path: Path) -> Database:
+    """A new database; :func:`store` closes it."""
     path = tmp_path / "switchboard.db"
-    shutil.copyfile(upgraded, path)
+    write_empty_database(path)
     return Database(f"sqlite:///{path}")
 
 
 @pytest.fixture
 def store(database: Database) -> Iterator[AsyncDatabase]:
-    """The store of a relay, running on the reactor of the tests."""
+    """A relay's database access, on the reactor of the tests."""
     running = AsyncDatabase(reactor, database)  # type: ignore[arg-type]  # to mypy it is a module
     running.start()
     yield running
@@ -55,8 +45,8 @@ def store(database: Database) -> Iterator[AsyncDatabase]:
 
 
 @pytest.fixture
-def front(store: AsyncDatabase) -> Iterator[Desk]:
-    """A desk with ann, who operates rover and knows nothing of hidden."""
-    made = Desk(store)
+def front(store: AsyncDatabase) -> Iterator[SessionsWorld]:
+    """A session manager; ann operates rover and does not know of the robot hidden."""
+    made = SessionsWorld(store)
     yield made
     made.auth.stop()

@@ -1,4 +1,4 @@
-"""The only judge, with a real database: what is open follows the rights."""
+"""Decisions about rights, with a real database: open sessions follow the rights."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from relay_protocol.rights import Level, Operation
 from relay_server import access as module
 from relay_server.access import Access, BadCredentials, Permit, Principal
 from relay_server.common.database import AsyncDatabase
+from relay_server.robots.registry import RobotState
 
 HASH = "ab" * 32
 
 
 @dataclass
-class Hall:
+class World:
     """An access with one user, one token and one robot in its database."""
 
     store: AsyncDatabase
     now: float = 1000.0
-    told: list[str] = field(default_factory=list)
+    reported: list[str] = field(default_factory=list)
 
-    async def open(self) -> Hall:
-        """Fill the database."""
+    async def open(self) -> World:
+        """Fills the database."""
         self.access = Access(self.store, lambda: self.now)
         self.user = await self.store.write(queries.add_user, "ann", None)
         self.robot = await self.store.write(queries.add_robot, "rover")
@@ -42,26 +43,26 @@ class Hall:
         return self
 
     async def grant(self, level: str, **patterns: Any) -> None:
-        """Give ann a right on the robot."""
+        """Gives ann a right on the robot."""
         await self.store.write(queries.grant_right, self.robot.id, level, user_id=self.user.id, **patterns)
 
     def slow_down(self) -> SlowStore:
-        """What the access reads from now on comes when the test lets it."""
+        """Reads of the access wait from now on until the test releases them."""
         slow = SlowStore(self.store)
         self.access._store = cast(AsyncDatabase, slow)
         return slow
 
     async def permit(self) -> Permit:
-        """A permit whose holder notes what it is told."""
+        """A permit whose holder records its notifications."""
         permit = await self.access.permit(self.principal, self.robot)
         assert permit is not None
-        permit.on_change = lambda: self.told.append("changed")
-        permit.on_revoke = lambda error: self.told.append(f"{type(error).__name__}: {error}")
+        permit.on_change = lambda: self.reported.append("changed")
+        permit.on_revoke = lambda error: self.reported.append(f"{type(error).__name__}: {error}")
         return permit
 
 
 class SlowStore:
-    """A store in front of another: the first read waits after it has been done, until the test lets it go."""
+    """A database whose first read returns its result only when the test releases it."""
 
     def __init__(self, store: AsyncDatabase) -> None:
         self._store = store
@@ -69,7 +70,6 @@ class SlowStore:
         self.go: Deferred[None] = Deferred()
 
     async def read(self, query: Callable[..., Any], *args: Any) -> Any:
-        """As the store's."""
         found = await self._store.read(query, *args)
         if not self.read_done.called:
             self.read_done.callback(None)
@@ -79,28 +79,28 @@ class SlowStore:
 
 @pytest_twisted.ensureDeferred
 async def test_a_permit_judges_by_the_rights_in_the_database(store: AsyncDatabase) -> None:
-    """And there is none without any right."""
-    hall = await Hall(store).open()
-    permit = await hall.permit()
-    assert permit.judge(Operation.SUBSCRIBE, "/scan").allowed
-    assert not permit.judge(Operation.PUBLISH, "/cmd_vel").allowed
-    await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
-    assert await hall.access.permit(hall.principal, hall.robot) is None
+    """Without any right there is no permit."""
+    world = await World(store).open()
+    permit = await world.permit()
+    assert permit.decide(Operation.SUBSCRIBE, "/scan").allowed
+    assert not permit.decide(Operation.PUBLISH, "/cmd_vel").allowed
+    await store.write(queries.revoke_right, world.robot.id, user_id=world.user.id)
+    assert await world.access.permit(world.principal, world.robot) is None
 
 
 @pytest_twisted.ensureDeferred
 async def test_changed_rights_reach_what_is_open(store: AsyncDatabase) -> None:
-    """The permit judges anew in place, and its holder is told once; nothing changed, nothing told."""
-    hall = await Hall(store).open()
-    permit = await hall.permit()
-    await hall.access.refresh()
-    assert hall.told == []
-    await hall.grant("operator", deny=["publish:/arm"])
-    await hall.access.refresh()
-    await hall.access.refresh()
-    assert hall.told == ["changed"]
+    """The permit changes in place, and its holder is notified once; without a change it is not."""
+    world = await World(store).open()
+    permit = await world.permit()
+    await world.access.refresh()
+    assert world.reported == []
+    await world.grant("operator", deny=["publish:/arm"])
+    await world.access.refresh()
+    await world.access.refresh()
+    assert world.reported == ["changed"]
     assert permit.rules.level is Level.OPERATOR
-    assert not permit.judge(Operation.PUBLISH, "/arm").allowed
+    assert not permit.decide(Operation.PUBLISH, "/arm").allowed
 
 
 @pytest.mark.parametrize(
@@ -112,183 +112,180 @@ async def test_changed_rights_reach_what_is_open(store: AsyncDatabase) -> None:
     ],
 )
 @pytest_twisted.ensureDeferred
-async def test_what_is_revoked_is_told_once_and_nothing_is_allowed_after(
-    store: AsyncDatabase, what: str, words: str
-) -> None:
-    """A right, a token, an account: each ends what was opened with it."""
-    hall = await Hall(store).open()
-    permit = await hall.permit()
+async def test_revocation_is_reported_once_and_final(store: AsyncDatabase, what: str, words: str) -> None:
+    """A revoked right, token or account ends everything opened with it."""
+    world = await World(store).open()
+    permit = await world.permit()
     if what == "right":
-        await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
+        await store.write(queries.revoke_right, world.robot.id, user_id=world.user.id)
     elif what == "token":
-        await store.write(queries.revoke_token, hall.principal.token_id)
+        await store.write(queries.revoke_token, world.principal.token_id)
     else:
-        await store.write(queries.set_disabled, hall.user.id, True)
-    await hall.access.refresh()
-    await hall.access.refresh()
-    assert hall.told == [words]
-    assert not permit.judge(Operation.SUBSCRIBE, "/scan").allowed
+        await store.write(queries.set_disabled, world.user.id, True)
+    await world.access.refresh()
+    await world.access.refresh()
+    assert world.reported == [words]
+    assert not permit.decide(Operation.SUBSCRIBE, "/scan").allowed
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_token_that_runs_out_ends_what_is_open(store: AsyncDatabase) -> None:
-    """To the second, without asking the database."""
-    hall = await Hall(store).open()
-    await hall.permit()
-    hall.now = 4999.9
-    hall.access.expire()
-    assert hall.told == []
-    hall.now = 5000.0
-    hall.access.expire()
-    hall.access.expire()
-    assert hall.told == ["BadCredentials: your session has expired; log in again"]
+    """To the second, without reading the database."""
+    world = await World(store).open()
+    await world.permit()
+    world.now = 4999.9
+    world.access.expire()
+    assert world.reported == []
+    world.now = 5000.0
+    world.access.expire()
+    world.access.expire()
+    assert world.reported == ["BadCredentials: your session has expired; log in again"]
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_released_permit_is_told_nothing(store: AsyncDatabase) -> None:
-    """Nobody holds it, nothing keeps it."""
-    hall = await Hall(store).open()
-    permit = await hall.permit()
-    hall.access.release(permit)
-    hall.access.release(permit)
-    await store.write(queries.revoke_token, hall.principal.token_id)
-    await hall.access.refresh()
-    assert hall.told == []
-    assert not hall.access._permits
+async def test_a_released_permit_is_not_notified(store: AsyncDatabase) -> None:
+    world = await World(store).open()
+    permit = await world.permit()
+    world.access.release(permit)
+    world.access.release(permit)
+    await store.write(queries.revoke_token, world.principal.token_id)
+    await world.access.refresh()
+    assert world.reported == []
+    assert not world.access._permits
 
 
 @pytest_twisted.ensureDeferred
 async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: AsyncDatabase) -> None:
-    """A refresh that goes by between the reading and its result is not missed."""
-    hall = await Hall(store).open()
-    slow = hall.slow_down()
-    asking = Deferred.fromCoroutine(hall.access.permit(hall.principal, hall.robot))
+    """A refresh between the read and its result is not missed."""
+    world = await World(store).open()
+    slow = world.slow_down()
+    asking = Deferred.fromCoroutine(world.access.permit(world.principal, world.robot))
     await slow.read_done
-    await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
-    await hall.access.refresh()
+    await store.write(queries.revoke_right, world.robot.id, user_id=world.user.id)
+    await world.access.refresh()
     slow.go.callback(None)
     assert await asking is None
-    assert not hall.access._permits
+    assert not world.access._permits
 
 
 @pytest_twisted.ensureDeferred
 async def test_no_list_is_kept_of_rights_revoked_while_they_were_read(store: AsyncDatabase) -> None:
-    """The next look shows the truth."""
-    hall = await Hall(store).open()
-    slow = hall.slow_down()
-    asking = Deferred.fromCoroutine(hall.access.robots(hall.principal))
+    """The next look-up has the present rights."""
+    world = await World(store).open()
+    slow = world.slow_down()
+    asking = Deferred.fromCoroutine(world.access.robots(world.principal))
     await slow.read_done
-    await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
-    await hall.access.refresh()
+    await store.write(queries.revoke_right, world.robot.id, user_id=world.user.id)
+    await world.access.refresh()
     slow.go.callback(None)
     await asking
-    assert await hall.access.robots(hall.principal) == []
+    assert await world.access.robots(world.principal) == []
 
 
 @pytest_twisted.ensureDeferred
 async def test_no_permit_for_a_token_that_ended_since_it_was_proved(store: AsyncDatabase) -> None:
-    """Between the token's proof and the permit anything may happen."""
-    hall = await Hall(store).open()
-    await store.write(queries.revoke_token, hall.principal.token_id)
+    """The token may end between its authentication and the permit."""
+    world = await World(store).open()
+    await store.write(queries.revoke_token, world.principal.token_id)
     with pytest.raises(BadCredentials, match="session was ended"):
-        await hall.access.permit(hall.principal, hall.robot)
+        await world.access.permit(world.principal, world.robot)
 
 
 @pytest_twisted.ensureDeferred
 async def test_robots_are_listed_with_the_right_on_each(store: AsyncDatabase) -> None:
-    """Kept until something changes, then read again."""
-    hall = await Hall(store).open()
+    """The list is cached until a change."""
+    world = await World(store).open()
     await store.write(queries.add_robot, "hidden")
-    ((robot, rules),) = await hall.access.robots(hall.principal)
+    ((robot, rules),) = await world.access.robots(world.principal)
     assert (robot.name, rules.level) == ("rover", Level.VIEWER)
-    await hall.grant("owner")
-    ((_, rules),) = await hall.access.robots(hall.principal)
+    await world.grant("owner")
+    ((_, rules),) = await world.access.robots(world.principal)
     assert rules.level is Level.VIEWER
-    await hall.access.refresh()
-    ((_, rules),) = await hall.access.robots(hall.principal)
+    await world.access.refresh()
+    ((_, rules),) = await world.access.robots(world.principal)
     assert rules.level is Level.OWNER
 
 
 @pytest.mark.parametrize("ended", ["token", "user", "time", "nothing"])
 @pytest_twisted.ensureDeferred
 async def test_a_token_is_remembered_while_it_counts(store: AsyncDatabase, ended: str) -> None:
-    """Changes in the database are taken up as for what is open."""
-    hall = await Hall(store).open()
-    hall.access.remember(HASH, hall.principal, hall.access.refreshed)
-    assert hall.access.remembered(HASH) == hall.principal
+    """Changes in the database are applied as for open sessions."""
+    world = await World(store).open()
+    world.access.remember(HASH, world.principal, world.access.refreshed)
+    assert world.access.remembered_principal(HASH) == world.principal
     if ended == "token":
-        await store.write(queries.revoke_token, hall.principal.token_id)
+        await store.write(queries.revoke_token, world.principal.token_id)
     elif ended == "user":
-        await store.write(queries.set_disabled, hall.user.id, True)
+        await store.write(queries.set_disabled, world.user.id, True)
     elif ended == "time":
-        hall.now = 5000.0
-    await hall.access.refresh()
-    assert hall.access.remembered(HASH) == (hall.principal if ended == "nothing" else None)
+        world.now = 5000.0
+    await world.access.refresh()
+    assert world.access.remembered_principal(HASH) == (world.principal if ended == "nothing" else None)
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_is_remembered_follows_what_its_user_may(store: AsyncDatabase) -> None:
-    """Who was made an administrator is one at the next request, and who is none any more is not."""
-    hall = await Hall(store).open()
-    hall.access.remember(HASH, hall.principal, hall.access.refreshed)
+async def test_cached_results_follow_the_users_rights(store: AsyncDatabase) -> None:
+    """A new administrator is one at the next request, and a former one is not."""
+    world = await World(store).open()
+    world.access.remember(HASH, world.principal, world.access.refreshed)
     for admin in (True, False):
-        await store.write(queries.set_admin, hall.user.id, admin)
-        await hall.access.refresh()
-        assert hall.access.remembered(HASH) == replace(hall.principal, admin=admin)
+        await store.write(queries.set_admin, world.user.id, admin)
+        await world.access.refresh()
+        assert world.access.remembered_principal(HASH) == replace(world.principal, admin=admin)
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_is_remembered_proves_nothing_without_a_look_at_the_database(store: AsyncDatabase) -> None:
-    """Nor one that is too long ago; one that began before another and ended after it takes nothing away."""
+async def test_cached_token_needs_the_database_revision(store: AsyncDatabase) -> None:
+    """An old check does not count; overlapping checks do not undo each other."""
     seconds = 50.0
-    hall = await Hall(store).open()
-    access = Access(store, lambda: hall.now, lambda: seconds)
-    access.remember(HASH, hall.principal, access.refreshed)
-    assert access.proves(HASH) is None
-    access.in_step(50.0)
-    access.in_step(49.0)
-    seconds += module.IN_STEP_SECONDS
-    assert access.proves(HASH) == hall.principal
+    world = await World(store).open()
+    access = Access(store, lambda: world.now, lambda: seconds)
+    access.remember(HASH, world.principal, access.refreshed)
+    assert access.recent_principal(HASH) is None
+    access.set_known_until(50.0)
+    access.set_known_until(49.0)
+    seconds += module.RECENT_READ_SECONDS
+    assert access.recent_principal(HASH) == world.principal
     seconds += 0.1
-    assert access.proves(HASH) is None
-    access.in_step(seconds)
-    hall.now = 5000.0
-    assert access.proves(HASH) is None
+    assert access.recent_principal(HASH) is None
+    access.set_known_until(seconds)
+    world.now = 5000.0
+    assert access.recent_principal(HASH) is None
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_token_that_was_looked_up_before_a_change_is_not_remembered(store: AsyncDatabase) -> None:
-    """The change may have been about just that."""
-    hall = await Hall(store).open()
-    before = hall.access.refreshed
-    await hall.access.refresh()
-    hall.access.remember(HASH, hall.principal, before)
-    assert hall.access.remembered(HASH) is None
+    """The change may concern that token."""
+    world = await World(store).open()
+    before = world.access.refreshed
+    await world.access.refresh()
+    world.access.remember(HASH, world.principal, before)
+    assert world.access.remembered_principal(HASH) is None
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_is_remembered_is_bounded(store: AsyncDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The longest unused is forgotten."""
+async def test_cache_is_bounded(store: AsyncDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The least recently used is removed."""
     monkeypatch.setattr(module, "PROVED", 2)
-    hall = await Hall(store).open()
+    world = await World(store).open()
     for token_hash in ("a", "b", "c"):
-        hall.access.remember(token_hash, hall.principal, hall.access.refreshed)
-        # To be asked for is to be used.
-        assert hall.access.remembered("a")
-    assert [token_hash for token_hash in "abc" if hall.access.remembered(token_hash)] == ["a", "c"]
+        world.access.remember(token_hash, world.principal, world.access.refreshed)
+        # A request counts as a use.
+        assert world.access.remembered_principal("a")
+    assert [token_hash for token_hash in "abc" if world.access.remembered_principal(token_hash)] == ["a", "c"]
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_an_earlier_look_has_read_does_not_come_after_a_later_one(store: AsyncDatabase) -> None:
-    """A logout and somebody's change ask at once: the rights that hold are those of the last change."""
-    hall = await Hall(store).open()
-    permit = await hall.permit()
-    slow = hall.slow_down()
-    first = Deferred.fromCoroutine(hall.access.refresh())
+async def test_earlier_reading_does_not_follow_a_later_one(store: AsyncDatabase) -> None:
+    """A logout and another change cause two readings: the rights of the last change hold."""
+    world = await World(store).open()
+    permit = await world.permit()
+    slow = world.slow_down()
+    first = Deferred.fromCoroutine(world.access.refresh())
     await slow.read_done
-    await hall.grant("operator")
-    second = Deferred.fromCoroutine(hall.access.refresh())
-    # What it reads, if it does not wait for its turn, comes from a thread: all of them have been used once by then.
+    await world.grant("operator")
+    second = Deferred.fromCoroutine(world.access.refresh())
+    # Without a queue it would read in a thread of the pool, each of which has been used once by then.
     for _ in range(4):
         await store.read(queries.revision)
     slow.go.callback(None)
@@ -298,73 +295,75 @@ async def test_what_an_earlier_look_has_read_does_not_come_after_a_later_one(sto
 
 
 @pytest_twisted.ensureDeferred
-async def test_who_has_a_right_is_known_without_the_database(store: AsyncDatabase) -> None:
-    """From what is open, from what was looked up since the last change, and from nothing else."""
-    hall = await Hall(store).open()
-    access, robot = hall.access, hall.robot.id
-    assert not access.knows(hall.principal, robot)
-    permit = await hall.permit()
+async def test_rights_are_known_without_the_database(store: AsyncDatabase) -> None:
+    """From open sessions and look-ups since the last change only."""
+    world = await World(store).open()
+    access, robot = world.access, world.robot.id
+    assert not access.knows(world.principal, robot)
+    permit = await world.permit()
     await access.refresh()
-    assert access.knows(hall.principal, robot)
+    assert access.knows(world.principal, robot)
     access.release(permit)
-    assert not access.knows(hall.principal, robot)
-    access.release(await hall.permit())
-    assert access.knows(hall.principal, robot)
+    assert not access.knows(world.principal, robot)
+    access.release(await world.permit())
+    assert access.knows(world.principal, robot)
     await access.refresh()
-    await access.robots(hall.principal)
-    assert access.knows(hall.principal, robot)
-    assert not access.knows(hall.principal, robot + 1)
-    await store.write(queries.revoke_right, robot, user_id=hall.user.id)
+    await access.robots(world.principal)
+    assert access.knows(world.principal, robot)
+    assert not access.knows(world.principal, robot + 1)
+    assert access.may_stop_at_once(world.principal, RobotState(robot, "rover", world.principal.realm))
+    assert not access.may_stop_at_once(world.principal, RobotState(robot, "rover", "elsewhere"))
+    await store.write(queries.revoke_right, robot, user_id=world.user.id)
     await access.refresh()
-    assert not access.knows(hall.principal, robot)
+    assert not access.knows(world.principal, robot)
 
 
-async def _with_scope(hall: Hall, scope: str) -> Principal:
-    """Ann by a token for less."""
+async def _with_scope(world: World, scope: str) -> Principal:
+    """Ann, with a token limited to a scope."""
     hash = "cd" * 32
-    await hall.store.write(
-        queries.create_token, hall.user.id, hash, kind="access", expires=None, now=hall.now, scope=scope
+    await world.store.write(
+        queries.create_token, world.user.id, hash, kind="access", expires=None, now=world.now, scope=scope
     )
-    record = await hall.store.read(queries.principal_by_token, hash, hall.now)
+    record = await world.store.read(queries.principal_by_token, hash, world.now)
     assert record is not None
     return Principal.of(record)
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_scope_narrows_what_a_token_opens(store: AsyncDatabase) -> None:
-    """The permit judges by both, and goes on to when the rights change."""
-    hall = await Hall(store).open()
-    await hall.grant("operator")
-    narrow = await _with_scope(hall, "viewer call:/dock@rover")
-    permit = await hall.access.permit(narrow, hall.robot)
+    """The permit follows both, also after a change of rights."""
+    world = await World(store).open()
+    await world.grant("operator")
+    narrow = await _with_scope(world, "viewer call:/dock@rover")
+    permit = await world.access.permit(narrow, world.robot)
     assert permit is not None
-    assert permit.judge(Operation.CALL, "/dock").allowed
-    assert not permit.judge(Operation.PUBLISH, "/cmd_vel").allowed
-    assert hall.access.knows(narrow, hall.robot.id)
-    await hall.grant("owner")
-    await hall.access.refresh()
-    assert permit.judge(Operation.CALL, "/dock").allowed
-    assert not permit.judge(Operation.PUBLISH, "/cmd_vel").allowed
-    await hall.grant("viewer")
-    await hall.access.refresh()
-    assert not permit.judge(Operation.CALL, "/dock").allowed
+    assert permit.decide(Operation.CALL, "/dock").allowed
+    assert not permit.decide(Operation.PUBLISH, "/cmd_vel").allowed
+    assert world.access.knows(narrow, world.robot.id)
+    await world.grant("owner")
+    await world.access.refresh()
+    assert permit.decide(Operation.CALL, "/dock").allowed
+    assert not permit.decide(Operation.PUBLISH, "/cmd_vel").allowed
+    await world.grant("viewer")
+    await world.access.refresh()
+    assert not permit.decide(Operation.CALL, "/dock").allowed
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_robot_outside_the_scope_is_not_there(store: AsyncDatabase) -> None:
-    """Neither in the list nor by name, however well the user's other tokens know it."""
-    hall = await Hall(store).open()
-    narrow = await _with_scope(hall, "owner@other")
-    assert await hall.access.permit(hall.principal, hall.robot) is not None
-    assert [record.name for record, _ in await hall.access.robots(hall.principal)] == ["rover"]
-    assert await hall.access.robots(narrow) == []
-    assert await hall.access.permit(narrow, hall.robot) is None
-    assert not hall.access.knows(narrow, hall.robot.id)
+    """Neither in the list nor by name, even if the user's other tokens know it."""
+    world = await World(store).open()
+    narrow = await _with_scope(world, "owner@other")
+    assert await world.access.permit(world.principal, world.robot) is not None
+    assert [record.name for record, _ in await world.access.robots(world.principal)] == ["rover"]
+    assert await world.access.robots(narrow) == []
+    assert await world.access.permit(narrow, world.robot) is None
+    assert not world.access.knows(narrow, world.robot.id)
 
 
 @pytest_twisted.ensureDeferred
 async def test_an_administrators_token_administers_if_its_scope_says_so(store: AsyncDatabase) -> None:
-    """One to look at robots is no key to the house."""
-    hall = await Hall(store).open()
-    await store.write(queries.set_admin, hall.user.id, True)
-    assert not (await _with_scope(hall, "owner")).admin
+    """A token for viewing robots does not administer."""
+    world = await World(store).open()
+    await store.write(queries.set_admin, world.user.id, True)
+    assert not (await _with_scope(world, "owner")).admin

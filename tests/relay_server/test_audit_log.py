@@ -1,4 +1,4 @@
-"""Audit entries of what has happened outlast a database that can't be written."""
+"""Audit entries survive a database that cannot be written."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from relay_db.queries import AuditRecord
 from relay_server import audit_log as module
 from relay_server.audit_log import (
     BATCH,
+    CLOSE_SECONDS,
     FILE,
-    KEEP_SECONDS,
     RETRY_SECONDS,
     UNREADABLE,
     AuditLog,
@@ -39,45 +39,45 @@ class Scene:
     def __init__(self, store: AsyncDatabase, folder: Path) -> None:
         self.store, self.folder = store, folder
         self.clock = Clock()
-        self.told: list[tuple[str, int]] = []
+        self.reported: list[tuple[str, int]] = []
         self.audit = self.another()
 
     def another(self) -> AuditLog:
-        """That of the next relay."""
+        """The audit log of the next relay."""
         return AuditLog(
-            self.clock, self.store, self.folder, lambda kind, robot: self.told.append((kind, robot))
+            self.clock, self.store, self.folder, lambda kind, robot: self.reported.append((kind, robot))
         )
 
     def append(self, *numbers: int) -> None:
-        """What happened at these moments."""
+        """Appends entries with these times."""
         for number in numbers:
             self.audit.append(
                 AuditLogEntry(number, "user:ann", "control.taken", "rover", data={}, robots=(ROVER,))
             )
 
     async def settled(self, audit: AuditLog | None = None) -> None:
-        """Until no write is under way."""
+        """Waits until no write is active."""
         while (audit or self.audit)._writing:
             await deferLater(reactor, 0.01)  # type: ignore[arg-type]  # to mypy it is a module
 
     async def tries_again(self) -> None:
-        """The pause after a failure is over."""
+        """The pause after a failure ends."""
         self.clock.advance(RETRY_SECONDS)
         await self.settled()
 
     async def kept(self) -> list[AuditRecord]:
-        """What the database has; its chain is whole."""
+        """Entries in the database, whose chain must be valid."""
         assert await self.store.read(queries.verify_audit) is None
         return (await self.store.read(queries.list_audit, limit=10_000))[::-1]
 
     async def times(self) -> list[float]:
-        """When those happened."""
+        """Times of these entries."""
         return [each.at for each in await self.kept()]
 
 
 @pytest.fixture
 def scene(store: AsyncDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
-    """Nothing written yet. A locked file is given up soon."""
+    """An empty audit log. A write to a locked file fails soon."""
     monkeypatch.setattr(sqlite, "BUSY_SECONDS", 0.05)
     return Scene(store, tmp_path)
 
@@ -96,7 +96,7 @@ def locked(scene: Scene) -> Iterator[None]:
 
 @contextmanager
 def full(scene: Scene) -> Iterator[None]:
-    """SQLite may not make the file any larger, on each connection."""
+    """SQLite may not enlarge the file, on each connection."""
 
     def limit(on: bool) -> None:
         with scene.store.database.connection() as connection:
@@ -112,7 +112,7 @@ def full(scene: Scene) -> Iterator[None]:
 
 @pytest_twisted.ensureDeferred
 async def test_entries_of_a_locked_database_are_written_in_order_with_their_time(scene: Scene) -> None:
-    """However often the writing fails; later ones stand behind them."""
+    """For any number of failures; later entries follow."""
     with locked(scene):
         scene.append(1, 2)
         await scene.settled()
@@ -122,12 +122,12 @@ async def test_entries_of_a_locked_database_are_written_in_order_with_their_time
     scene.append(4)
     await scene.tries_again()
     assert await scene.times() == [1, 2, 3, 4]
-    assert scene.told == []
+    assert scene.reported == []
 
 
 @pytest_twisted.ensureDeferred
 async def test_entries_of_a_full_disk_are_written_when_there_is_room(scene: Scene) -> None:
-    """SQLITE_FULL: what is too much for the last page waits as a whole."""
+    """SQLITE_FULL: a transaction that does not fit waits as a whole."""
     with full(scene):
         for first in range(0, 1000, 50):
             scene.append(*range(first, first + 50))
@@ -142,15 +142,13 @@ async def test_entries_of_a_full_disk_are_written_when_there_is_room(scene: Scen
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_finds_no_room_is_one_entry_and_told(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It stands where the lost ones would, and says how many they were and until when."""
+async def test_lost_entries_are_one_entry_and_an_event(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes the place of the lost ones, with their number and their last time."""
     monkeypatch.setattr(module, "WAITING", 3)
     with locked(scene), capturedLogs() as logs:
         scene.append(1, 2, 3, 4, 5)
         await scene.settled()
-        assert scene.told == [("audit.lost", ROVER)] * 2
+        assert scene.reported == [("audit.lost", ROVER)] * 2
     lines = [formatEvent(each) for each in logs if each["log_level"] is LogLevel.error]
     assert (
         lines == ["'control.taken' of rover by user:ann is not on record: the database does not keep up"] * 2
@@ -161,7 +159,7 @@ async def test_what_finds_no_room_is_one_entry_and_told(
     kept = await scene.kept()
     assert [each.at for each in kept] == [1, 2, 3, 4, 6]
     assert (kept[3].actor, kept[3].action, kept[3].data) == ("relay", "audit.lost", {"count": 2, "until": 5})
-    assert scene.told[2:] == [("audit.written", ROVER)]
+    assert scene.reported[2:] == [("audit.written", ROVER)]
     assert scene.audit.lost == 2
 
 
@@ -178,7 +176,6 @@ async def test_many_are_written_in_several_transactions(scene: Scene) -> None:
 
 @pytest_twisted.ensureDeferred
 async def test_an_entry_that_can_not_be_written_at_all_holds_up_no_other(scene: Scene) -> None:
-    """It is in the log, and its robot's owners are told."""
     with locked(scene), capturedLogs() as logs:
         scene.append(1)
         scene.audit.append(
@@ -196,12 +193,12 @@ async def test_an_entry_that_can_not_be_written_at_all_holds_up_no_other(scene: 
     ]
     assert kept[2].data == {"count": 1, "until": 2}
     assert any("not on record" in str(formatEvent(each)) for each in logs)
-    assert scene.told == [("audit.lost", ROVER), ("audit.written", ROVER)]
+    assert scene.reported == [("audit.lost", ROVER), ("audit.written", ROVER)]
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_waits_when_the_relay_stops_is_written_by_the_next(scene: Scene) -> None:
-    """From a file for its owner's eyes, which is gone afterwards."""
+async def test_waiting_entries_are_written_by_the_next_relay(scene: Scene) -> None:
+    """They are read from a file with restricted permissions, which is removed afterwards."""
     before = os.umask(0)
     try:
         with locked(scene):
@@ -209,7 +206,7 @@ async def test_what_waits_when_the_relay_stops_is_written_by_the_next(scene: Sce
             await scene.settled()
             closing = Deferred.fromCoroutine(scene.audit.close())
             await scene.settled()
-            scene.clock.advance(KEEP_SECONDS)
+            scene.clock.advance(CLOSE_SECONDS)
             await closing
     finally:
         os.umask(before)
@@ -226,7 +223,7 @@ async def test_what_waits_when_the_relay_stops_is_written_by_the_next(scene: Sce
 async def test_an_entry_of_that_file_that_is_in_the_database_already_is_not_written_twice(
     scene: Scene,
 ) -> None:
-    """A commit may have been done though the relay did not learn of it."""
+    """A commit may succeed without the relay noticing."""
     scene.append(1, 2)
     await scene.settled()
     line = b'{"at":%d,"actor":"user:ann","action":"control.taken","target":"rover"}\n'
@@ -242,7 +239,7 @@ async def test_an_entry_of_that_file_that_is_in_the_database_already_is_not_writ
 
 @pytest_twisted.ensureDeferred
 async def test_a_relay_that_stops_in_order_leaves_no_file(scene: Scene) -> None:
-    """All is written before it is gone, also what waited for the next attempt."""
+    """All entries are written before the end, including those that waited for a retry."""
     with locked(scene):
         scene.append(1)
         await scene.settled()
@@ -252,8 +249,10 @@ async def test_a_relay_that_stops_in_order_leaves_no_file(scene: Scene) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_can_be_kept_nowhere_is_in_the_log(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With all that the entry says."""
+async def test_entries_that_cannot_be_stored_are_logged(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With all their fields."""
 
     def no_space(*_: Any) -> None:
         raise OSError(28, "No space left on device")
@@ -264,7 +263,7 @@ async def test_what_can_be_kept_nowhere_is_in_the_log(scene: Scene, monkeypatch:
         await scene.settled()
         closing = Deferred.fromCoroutine(scene.audit.close())
         await scene.settled()
-        scene.clock.advance(KEEP_SECONDS)
+        scene.clock.advance(CLOSE_SECONDS)
         await closing
     (line,) = [formatEvent(each) for each in logs if each["log_level"] is LogLevel.critical]
     assert line.startswith("not on record, No space left on device: AuditLogEntry(at=1")

@@ -1,4 +1,4 @@
-"""Addresses to listen on, and settings made from them."""
+"""Addresses to listen on, and the settings made from them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from relay_server.config import ListenAddress, RelaySettings
     ],
 )
 def test_an_address_is_read_and_written_alike(text: str, host: str, port: int) -> None:
-    """Names, IPv4 and IPv6 in brackets; port 0 is any free one."""
+    """Names, IPv4, and IPv6 in brackets; port 0 means any free one."""
     endpoint = ListenAddress.parse(text)
     assert (endpoint.host, endpoint.port) == (host, port)
     assert str(endpoint) == text
@@ -43,17 +43,38 @@ def test_an_address_is_read_and_written_alike(text: str, host: str, port: int) -
         "[]:80",
     ],
 )
-def test_what_is_no_address_is_refused_in_words(text: str) -> None:
-    """The sentence shows what was given and the form that is wanted."""
+def test_invalid_address_is_refused_with_a_reason(text: str) -> None:
+    """The error has the value and the expected form."""
     with pytest.raises(Invalid, match="write HOST:PORT"):
         ListenAddress.parse(text)
 
 
 def test_tls_decides_the_scheme() -> None:
-    """With a certificate both listeners speak TLS, without one neither."""
+    """With a certificate both listeners use TLS, otherwise neither."""
     here = ListenAddress("localhost", 0)
     plain = RelaySettings(Path("data"), "sqlite://", here, here)
     secure = RelaySettings(Path("data"), "sqlite://", here, here, Path("cert"), Path("key"))
     assert (plain.tls, plain.scheme) == (False, "http")
     assert (secure.tls, secure.scheme) == (True, "https")
+    assert (plain.robots_tls, secure.robots_tls) == (False, True)
     assert plain.socket_path == Path("data/relay.sock")
+
+
+@pytest.mark.parametrize(
+    ("origins", "listens", "host", "tls"),
+    [
+        ((), "0.0.0.0:9091", "", False),
+        ((), "127.0.0.1:9091", "127.0.0.1", False),
+        ((), "[::1]:9091", "::1", False),
+        (("https://robots.example.org:9090", "http://x"), "0.0.0.0:9091", "robots.example.org", True),
+        (("https://robots.example.org",), "127.0.0.1:9091", "robots.example.org", True),
+        (("http://[2001:db8::7]:9090",), "[::]:9091", "2001:db8::7", False),
+    ],
+)
+def test_robots_dial_the_host_of_the_portal(
+    origins: tuple[str, ...], listens: str, host: str, tls: bool
+) -> None:
+    """Behind a proxy too, which listens there for both."""
+    here = ListenAddress("localhost", 0)
+    found = RelaySettings(Path("data"), "sqlite://", here, ListenAddress.parse(listens), origins=origins)
+    assert (found.robots_host, found.robots_tls) == (host, tls)

@@ -14,11 +14,11 @@ from cryptography.x509.oid import NameOID
 from OpenSSL import SSL
 
 from relay_protocol.errors import Invalid
-from relay_server.tls import ServerTls
+from relay_server.listeners import ServerTls
 
 
 def make(folder: Path, name: str) -> tuple[Path, Path]:
-    """A self-signed certificate and its key, as PEM files."""
+    """Makes a self-signed certificate and its key, as PEM files."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.UTC)
@@ -43,7 +43,7 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
 
 
 def handshake(other: SSL.Connection, newest: int = SSL.TLS1_3_VERSION) -> SSL.Connection:
-    """A client's end of a TLS connection in memory, after the handshake."""
+    """The client side of a TLS connection in memory, after the handshake."""
     context = SSL.Context(SSL.TLS_CLIENT_METHOD)
     context.set_max_proto_version(newest)
     client = SSL.Connection(context, None)
@@ -65,19 +65,19 @@ def handshake(other: SSL.Connection, newest: int = SSL.TLS1_3_VERSION) -> SSL.Co
 
 
 def connection(tls: ServerTls) -> SSL.Connection:
-    """What Twisted would have for a client that connects now."""
+    """The TLS connection that Twisted makes for a new client."""
     return tls.serverConnectionForTLS(None)
 
 
 def name_of(server: SSL.Connection) -> str:
-    """The common name a client sees."""
+    """The common name that a client sees."""
     certificate = handshake(server).get_peer_certificate()
     assert certificate is not None
     return str(certificate.get_subject().CN)
 
 
 def test_a_new_certificate_is_taken_up_by_reload(tmp_path: Path) -> None:
-    """New connections get the new one; connections made before keep the old one."""
+    """New connections get the new one; existing connections keep the old one."""
     cert, key = make(tmp_path, "old")
     tls = ServerTls(cert, key)
     before = connection(tls)
@@ -91,7 +91,7 @@ def test_a_new_certificate_is_taken_up_by_reload(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["missing", "junk", "another's key"])
 def test_a_certificate_that_can_not_be_used_leaves_the_old_one(tmp_path: Path, damage: str) -> None:
-    """A reload that fails says so in words and changes nothing."""
+    """The error of the reload has a reason, and nothing changes."""
     cert, key = make(tmp_path, "old")
     tls = ServerTls(cert, key)
     if damage == "missing":
@@ -105,15 +105,15 @@ def test_a_certificate_that_can_not_be_used_leaves_the_old_one(tmp_path: Path, d
     assert name_of(connection(tls)) == "old"
 
 
-def test_at_the_start_a_bad_certificate_is_an_error_in_words(tmp_path: Path) -> None:
-    """No path of the machine is told."""
-    with pytest.raises(Invalid, match="PEM files") as told:
+def test_at_the_start_a_bad_certificate_is_an_error_with_a_reason(tmp_path: Path) -> None:
+    """The error contains no path of the machine."""
+    with pytest.raises(Invalid, match="PEM files") as reported:
         ServerTls(tmp_path / "none.crt", tmp_path / "none.key")
-    assert str(tmp_path) not in str(told.value)
+    assert str(tmp_path) not in str(reported.value)
 
 
 def test_tls_below_1_2_is_refused(tmp_path: Path) -> None:
-    """1.2 is the least, as promised."""
+    """The minimum is 1.2."""
     tls = ServerTls(*make(tmp_path, "relay"))
     assert handshake(connection(tls), SSL.TLS1_2_VERSION).get_protocol_version_name() == "TLSv1.2"
     with pytest.raises(SSL.Error):

@@ -8,17 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import psutil
-from switchboard_forks import Forked, start
 
-from tests.robot_client.fake_relay import FakeRelay
 from tests.robot_client.ros import PATIENCE
+from tests.worlds.fake_relay import FakeRelay
+from tests.worlds.forked_programs import Forked, start
 
 
 def until(true: Callable[[], object], timeout: float = PATIENCE) -> None:
     deadline = time.monotonic() + timeout
     while not true():
         assert time.monotonic() < deadline, f"waited {timeout} s in vain"
-        time.sleep(0.02)  # what is waited for comes from other processes
+        time.sleep(0.02)  # the expected event comes from other processes
 
 
 class Robot:
@@ -28,16 +28,16 @@ class Robot:
         self.relay = relay
         self.state = state
         self.log = state.with_suffix(".log")
-        self._environment = environment
+        self.environment = environment
         self._processes: list[Forked] = []
 
-    def start(self, *arguments: str, stdin: str | None = None) -> Forked:
+    def start(self, *arguments: str, stdin: str | None = None, program: str = "switchboard-robot") -> Forked:
         said = None
         if stdin is not None:
             said = self.state.with_suffix(".stdin")
             said.write_text(stdin)
-        command = ["switchboard-robot", *arguments, "--state", str(self.state)]
-        process = start(command, self.log, self.log, env=self._environment, stdin=said)
+        command = [program, *arguments, "--state", str(self.state)]
+        process = start(command, self.log, self.log, env=self.environment, stdin=said)
         self._processes.append(process)
         return process
 

@@ -1,4 +1,4 @@
-"""What the tests with real ROS share: a domain of their own, a peer process."""
+"""Shared by tests with real ROS: a domain of their own, a peer process."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from switchboard_domains import free_domain
-from switchboard_waiting import freeze
 from twisted.internet import reactor, task
+
+from tests.worlds.ros_domains import free_domain
+from tests.worlds.waiting import freeze
 
 PATIENCE = 60.0
 CONFORMANCE = Path(__file__).parents[1] / "conformance"
@@ -24,7 +25,7 @@ CONFORMANCE = Path(__file__).parents[1] / "conformance"
 
 @contextmanager
 def domain() -> Iterator[dict[str, str]]:
-    """An environment with a ROS domain nobody else has, set for this process too."""
+    """An environment with an unused ROS domain, set for this process too."""
     ours = {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
@@ -39,7 +40,7 @@ def domain() -> Iterator[dict[str, str]]:
 
 
 async def until(true: Callable[[], Any], timeout: float = PATIENCE) -> None:
-    """Let the reactor turn until something is so."""
+    """Runs the reactor until the condition holds."""
     deadline = time.monotonic() + timeout
     while not true():
         assert time.monotonic() < deadline, f"waited {timeout} s in vain"
@@ -68,11 +69,11 @@ class Peer:
         for line in self._process.stdout:
             if line.startswith("{"):
                 self.record.append(json.loads(line))
-            else:  # the middleware's, which warns here of what other processes left
+            else:  # the middleware's log, which warns of other processes' files
                 sys.stderr.write(line)
 
     def do(self, *what: Any) -> None:
-        """Have something done, and wait until it is."""
+        """Runs a command, and waits until it is done."""
         assert self._process.stdin is not None
         done = len([each for each in self.record if "done" in each])
         self._process.stdin.write(json.dumps(what) + "\n")
@@ -80,22 +81,22 @@ class Peer:
         self.until(lambda: len([each for each in self.record if "done" in each]) > done)
 
     def heard(self, topic: str) -> list[dict[str, Any]]:
-        """What came on a topic so far."""
+        """Messages received on a topic so far."""
         return [each for each in list(self.record) if each.get("topic") == topic]
 
-    def told(self, what: str, name: str) -> list[dict[str, Any]]:
-        """What was told of something so far."""
+    def reported(self, what: str, name: str) -> list[dict[str, Any]]:
+        """Reports about a name so far."""
         return [each for each in list(self.record) if each.get(what) == name]
 
     def kill(self) -> None:
-        """End it at once, as a crash would."""
+        """Kills it, as a crash would."""
         self._process.kill()
         self._process.wait()
         self._finish()
 
     @contextmanager
     def frozen(self) -> Iterator[None]:
-        """Let it stand still for a while."""
+        """Freezes it for a while."""
         freeze(self._process.pid)
         try:
             yield
@@ -107,7 +108,7 @@ class Peer:
         while not true():
             assert self._process.poll() is None, "the peer ended"
             assert time.monotonic() < deadline, f"waited {timeout} s in vain"
-            time.sleep(0.01)  # what is waited for comes from another process
+            time.sleep(0.01)  # the expected event comes from another process
 
     def close(self) -> None:
         assert self._process.stdin is not None

@@ -1,4 +1,4 @@
-"""A ROS 2 node for tests, in a process of its own: publishes, serves, records; told what to do by lines on stdin."""
+"""A ROS 2 node for tests, in its own process: publishes, serves, records, by commands on stdin."""
 
 from __future__ import annotations
 
@@ -53,6 +53,16 @@ def slow(request: Trigger.Request, response: Trigger.Response) -> Trigger.Respon
     return response
 
 
+def hello(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    response.success, response.message = True, "Hello, world!"
+    return response
+
+
+def hello_late(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    time.sleep(0.4)  # longer than a caller with a short timeout waits
+    return hello(request, response)
+
+
 def advertise(topic: str, qos: str = "reliable") -> None:
     profile = {"latched": LATCHED, "best_effort": BEST_EFFORT, "reliable": QoSProfile(depth=10)}[qos]
     ends[topic] = node.create_publisher(String, topic, profile)
@@ -67,7 +77,12 @@ def unadvertise(topic: str) -> None:
 
 
 def serve(service: str, kind: str) -> None:
-    type, function = {"invert": (SetBool, invert), "slow": (Trigger, slow)}[kind]
+    type, function = {
+        "hello": (SetBool, hello),
+        "hello_late": (SetBool, hello_late),
+        "invert": (SetBool, invert),
+        "slow": (Trigger, slow),
+    }[kind]
     ends[service] = node.create_service(type, service, function, callback_group=ReentrantCallbackGroup())
 
 
@@ -98,15 +113,27 @@ def listen(topic: str, kind: str) -> None:
 
 
 def call(service: str, a: int, b: int) -> None:
-    """Ask for a sum; the answer, if one comes, is told."""
+    """Requests a sum; reports the answer."""
     client = ends.setdefault("call " + service, node.create_client(AddTwoInts, service))
     assert client.wait_for_service(20)
     future = client.call_async(AddTwoInts.Request(a=a, b=b))
     future.add_done_callback(lambda future: tell(answer=service, a=a, sum=future.result().sum))
 
 
+def switch(service: str, data: bool) -> None:
+    """Calls a service of the type SetBool; reports the answer."""
+    client = ends.setdefault("switch " + service, node.create_client(SetBool, service))
+    assert client.wait_for_service(20)
+
+    def answered(future: object) -> None:
+        answer = future.result()
+        tell(switched=service, data=data, success=answer.success, message=answer.message)
+
+    client.call_async(SetBool.Request(data=data)).add_done_callback(answered)
+
+
 def act(action: str, kind: str) -> None:
-    """Serve Fibonacci; ``kind`` says what becomes of goals."""
+    """Serves Fibonacci; ``kind`` determines the results of goals."""
 
     def count(goal: object) -> Fibonacci.Result:
         tell(began=action, order=goal.request.order)
@@ -130,7 +157,7 @@ def act(action: str, kind: str) -> None:
     def judge(goal: object) -> GoalResponse:
         if kind.startswith("late"):
             tell(thinks=action)
-            time.sleep(1.0)  # a server that thinks before it takes a goal
+            time.sleep(1.0)  # a server that delays the acceptance of a goal
         return GoalResponse.REJECT if kind == "reject" else GoalResponse.ACCEPT
 
     def wished(goal: object) -> CancelResponse:
@@ -150,7 +177,7 @@ def act(action: str, kind: str) -> None:
 
 
 def relent(action: str) -> None:
-    """Cancel goals from now on."""
+    """Cancels goals from now on."""
     relenting.add(action)
 
 
@@ -159,7 +186,7 @@ def unact(action: str) -> None:
 
 
 def send(action: str, order: int) -> None:
-    """Want a goal pursued; all that comes of it is told."""
+    """Sends a goal; reports all its events."""
     client = ends.setdefault("send " + action, Pursuer(node, Fibonacci, action))
     assert client.wait_for_server(20)
     future = client.send_goal_async(
@@ -193,14 +220,14 @@ def publishers(topic: str) -> None:
 
 
 def clock(seconds: float) -> None:
-    """Say once what time it is in the simulation."""
+    """Publishes simulated time once."""
     publisher = ends.setdefault("/clock", node.create_publisher(Clock, "/clock", 1))
     now = Time(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
     publisher.publish(Clock(clock=now))
 
 
 def declare(parameter: str, value: object) -> None:
-    """Have a parameter that may be deleted."""
+    """Declares a parameter that may be deleted."""
     node.declare_parameter(parameter, value, ParameterDescriptor(dynamic_typing=True))
 
 
@@ -210,7 +237,7 @@ def battery(topic: str, charge: float) -> None:
 
 
 def spin(executor: MultiThreadedExecutor) -> None:
-    """Turn for good: rclpy ends at one callback's fault, such as a handle that was just destroyed (rclpy #1355)."""
+    """Spins forever: rclpy stops at an error of one callback, such as a destroyed handle (rclpy #1355)."""
     while rclpy.ok():
         try:
             executor.spin()
@@ -222,7 +249,7 @@ def main() -> None:
     global node
     rclpy.init()
     node = rclpy.create_node("peer", namespace="/robot")
-    executor = MultiThreadedExecutor(12)  # a goal that goes on holds one
+    executor = MultiThreadedExecutor(12)  # an active goal has one
     executor.add_node(node)
     threading.Thread(target=spin, args=(executor,), daemon=True).start()
     tell(ready=True)

@@ -1,27 +1,27 @@
-"""What the relay is told of alerts, and told again when it may not have heard."""
+"""Alerts to the relay, sent again where they may not have arrived."""
 
 from __future__ import annotations
 
 import pytest
 
 from relay_protocol import link
-from robot_client.alerts import HEARING_NS, KEPT, AlertMemory
+from robot_client.alerts import MAX_ALERTS, STARTUP_NS, AlertReporter
 
 
 class Relay:
-    """The control link, which hears or does not, and says so or does not."""
+    """A control link that works or not, and acknowledges or not."""
 
     def __init__(self) -> None:
         self.registered = False
         self.answered: int | None = None
         self.heard: list[str] = []
 
-    def say(self, message: link.Message) -> None:
-        """Words, in short."""
+    def send(self, message: link.Message) -> None:
+        """Report alerts by their texts."""
         if isinstance(message, link.Alert):
             self.heard.append(f"{message.about} {'over' if message.over else message.text}".strip())
         else:
-            assert isinstance(message, link.AlertsTold)
+            assert isinstance(message, link.ActiveAlertsSent)
             self.heard.append("that is all")
 
 
@@ -31,67 +31,67 @@ class Scene:
     def __init__(self) -> None:
         self.relay = Relay()
         self.now = 0
-        self.memory = AlertMemory(self.relay, lambda: self.now)
+        self.reporter = AlertReporter(self.relay, lambda: self.now)
 
-    def tell(self, about: str, text: str = "broken", *, kind: str = "module", over: bool = False) -> None:
-        """One alert."""
+    def report(self, about: str, text: str = "broken", *, kind: str = "module", over: bool = False) -> None:
+        """Report one alert."""
         self.now += 1
-        self.memory.tell(link.Alert(level="error", text=text, kind=kind, about=about, over=over))
+        self.reporter.report(link.Alert(level="error", text=text, kind=kind, about=about, over=over))
 
     def comes(self) -> list[str]:
-        """The relay knows the robot again; what it hears."""
+        """Register the robot again; return what the relay receives."""
         self.relay.registered = True
-        self.memory.registered()
+        self.reporter.registered()
         return self.takes()
 
     def goes(self) -> None:
-        """The link is lost."""
+        """Lose the link."""
         self.relay.registered, self.relay.answered = False, None
 
     def takes(self) -> list[str]:
-        """What the relay heard since it was asked last."""
+        """Return what the relay received since the last call."""
         heard, self.relay.heard = self.relay.heard, []
         return heard
 
     def proves(self) -> None:
-        """What was said so far has arrived."""
+        """Confirm all that was sent so far."""
         self.now += 1
         self.relay.answered = self.now
-        self.memory.look()
+        self.reporter.flush()
 
 
 @pytest.fixture
 def scene() -> Scene:
-    """The relay knows the robot; nothing is wrong."""
+    """A registered robot without alerts."""
     made = Scene()
-    made.now = HEARING_NS
+    made.now = STARTUP_NS
     assert made.comes() == ["that is all"]
     return made
 
 
-def test_a_daemon_that_has_just_begun_hears_before_it_says_that_is_all() -> None:
-    """In the registration that lasts then, once; what it hears until then comes first."""
+def test_report_is_completed_five_seconds_after_the_start() -> None:
+    """Once in a registration, after the alerts until then."""
     scene = Scene()
     assert scene.comes() == []
-    scene.now = HEARING_NS // 2
+    scene.now = STARTUP_NS // 2
     scene.goes()
-    scene.memory.look()
+    scene.reporter.flush()
     assert scene.comes() == []
-    scene.now = HEARING_NS
-    scene.tell("arm")
+    scene.now = STARTUP_NS
+    scene.report("arm")
     assert scene.takes() == ["arm broken"]
     for _ in range(2):
-        scene.memory.look()
+        scene.reporter.flush()
     assert scene.takes() == ["that is all"]
     scene.goes()
     assert scene.comes() == ["arm broken", "that is all"]
 
 
-def test_a_loss_of_control_is_told_until_it_is_heard_and_no_more(scene: Scene) -> None:
-    """It has happened; what is wrong with a part of what controls the robot lasts, as with any other."""
+def test_loss_of_control_is_sent_until_it_has_arrived(scene: Scene) -> None:
+    """It is an event; alerts about a part of control last like others."""
     scene.goes()
-    scene.tell("", "lost", kind="control")
-    scene.tell("goals", "they go on", kind="control")
+    scene.report("", "lost", kind="control")
+    scene.report("goals", "they go on", kind="control")
     assert scene.comes() == ["lost", "goals they go on", "that is all"]
     scene.goes()
     assert "lost" in scene.comes()
@@ -100,22 +100,20 @@ def test_a_loss_of_control_is_told_until_it_is_heard_and_no_more(scene: Scene) -
     assert scene.comes() == ["goals they go on", "that is all"]
 
 
-def test_a_daemon_that_is_away_when_it_has_heard_says_so_when_it_is_back() -> None:
-    """Not into a link that is none."""
+def test_report_is_completed_at_the_next_registration() -> None:
     scene = Scene()
     scene.comes()
     scene.goes()
-    scene.now = HEARING_NS
-    scene.memory.look()
+    scene.now = STARTUP_NS
+    scene.reporter.flush()
     assert scene.takes() == []
     assert scene.comes() == ["that is all"]
 
 
-def test_what_lasts_is_told_at_each_registration(scene: Scene) -> None:
-    """Whether it has arrived or not."""
-    scene.tell("arm")
+def test_active_alerts_are_sent_at_each_registration(scene: Scene) -> None:
+    scene.report("arm")
     scene.proves()
-    scene.tell("leg")
+    scene.report("leg")
     assert scene.takes() == ["arm broken", "leg broken"]
     scene.goes()
     assert scene.comes() == ["arm broken", "leg broken", "that is all"]
@@ -123,13 +121,13 @@ def test_what_lasts_is_told_at_each_registration(scene: Scene) -> None:
     assert scene.comes() == ["arm broken", "leg broken", "that is all"]
 
 
-def test_what_was_said_into_a_dead_link_is_said_again(scene: Scene) -> None:
-    """That something is over, and words that have no end; of what has arrived only what lasts."""
-    scene.tell("arm")
-    scene.tell("", "look", kind="")
+def test_unconfirmed_alerts_are_sent_again(scene: Scene) -> None:
+    """Ends and single events too; of confirmed alerts only the active ones."""
+    scene.report("arm")
+    scene.report("", "look", kind="")
     scene.proves()
-    scene.tell("arm", over=True)
-    scene.tell("", "look again", kind="")
+    scene.report("arm", over=True)
+    scene.report("", "look again", kind="")
     scene.takes()
     scene.goes()
     assert scene.comes() == ["arm over", "look again", "that is all"]
@@ -138,43 +136,42 @@ def test_what_was_said_into_a_dead_link_is_said_again(scene: Scene) -> None:
     assert scene.comes() == ["that is all"]
 
 
-def test_what_began_and_is_over_is_not_told_as_if_it_began_again(scene: Scene) -> None:
-    """Unless nobody can have heard of it."""
-    scene.tell("arm")
+def test_ended_alert_is_not_sent_as_a_beginning_again(scene: Scene) -> None:
+    """Unless its beginning was never sent."""
+    scene.report("arm")
     scene.takes()
     scene.goes()
-    scene.tell("arm", over=True)
-    scene.tell("leg")
-    scene.tell("leg", over=True)
+    scene.report("arm", over=True)
+    scene.report("leg")
+    scene.report("leg", over=True)
     assert scene.takes() == []
     assert scene.comes() == ["arm over", "leg broken", "leg over", "that is all"]
 
 
-def test_what_is_remembered_is_bounded_and_who_forgot_does_not_say_that_is_all(scene: Scene) -> None:
-    """Else the relay would take for over what still lasts."""
-    for each in range(KEPT + 1):
-        scene.tell(f"part {each}")
+def test_memory_is_bounded_and_an_incomplete_report_is_not_completed(scene: Scene) -> None:
+    """The relay would end alerts that still last."""
+    for each in range(MAX_ALERTS + 1):
+        scene.report(f"part {each}")
     scene.proves()
-    assert len(scene.takes()) == KEPT + 1
+    assert len(scene.takes()) == MAX_ALERTS + 1
     scene.goes()
-    told = scene.comes()
-    assert len(told) == KEPT
-    assert "that is all" not in told
-    for each in range(KEPT + 1):
-        scene.tell(f"part {each}", over=True)
+    reported = scene.comes()
+    assert len(reported) == MAX_ALERTS
+    assert "that is all" not in reported
+    for each in range(MAX_ALERTS + 1):
+        scene.report(f"part {each}", over=True)
     scene.proves()
     scene.goes()
     scene.takes()
     assert scene.comes() == ["that is all"]
 
 
-def test_more_words_than_can_be_kept_push_out_none_that_last(scene: Scene) -> None:
-    """Of a robot that is away for long."""
-    scene.tell("arm")
+def test_single_events_do_not_displace_active_alerts(scene: Scene) -> None:
+    scene.report("arm")
     scene.goes()
-    for each in range(2 * KEPT):
-        scene.tell("", f"word {each}", kind="")
+    for each in range(2 * MAX_ALERTS):
+        scene.report("", f"word {each}", kind="")
     scene.takes()
-    told = scene.comes()
-    assert told[0] == "arm broken"
-    assert told[1:] == [f"word {each}" for each in range(KEPT, 2 * KEPT)] + ["that is all"]
+    reported = scene.comes()
+    assert reported[0] == "arm broken"
+    assert reported[1:] == [f"word {each}" for each in range(MAX_ALERTS, 2 * MAX_ALERTS)] + ["that is all"]

@@ -1,4 +1,4 @@
-"""Settings from file and environment."""
+"""Settings from defaults, file and environment."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import pytest
 from relay_protocol.errors import Invalid
 from robot_client.config import RobotSettings, load
 from robot_client.motion.rules import rules_of
-from robot_client.motion.safety import Times
+from robot_client.motion.watchdog import CommandTimes
 
 POSE = "geometry_msgs/msg/PoseStamped"
 
 
-def test_without_anything_the_defaults_hold() -> None:
-    """No file, no variables: stop within 500 ms, no ramp; velocities, joints and joysticks are motion."""
+def test_defaults() -> None:
     settings = load(None, {})
     assert settings == RobotSettings()
     assert settings.safety.policy.stop_within_ms == 500
@@ -31,8 +30,7 @@ def test_without_anything_the_defaults_hold() -> None:
     ]
 
 
-def test_environment_beats_file(tmp_path: Path) -> None:
-    """A variable overrides the same key of the file, other keys stay."""
+def test_variables_override_the_file(tmp_path: Path) -> None:
     file = tmp_path / "robot.toml"
     file.write_text('[safety]\nstop_within_ms = 300\nmotion_topics = ["/arm"]\n[ros]\nexecutor = "single"\n')
     settings = load(file, {"SWITCHBOARD_ROBOT_SAFETY_STOP_WITHIN_MS": "200", "PATH": "/bin"})
@@ -42,7 +40,6 @@ def test_environment_beats_file(tmp_path: Path) -> None:
 
 
 def test_lists_in_variables_have_commas() -> None:
-    """A list in a variable is divided by commas."""
     settings = load(None, {"SWITCHBOARD_ROBOT_SAFETY_MOTION_TOPICS": "/a, /b"})
     assert settings.safety.motion_topics == ["/a", "/b"]
 
@@ -58,11 +55,11 @@ def test_lists_in_variables_have_commas() -> None:
         ("[safety\n", "not TOML"),
         ('[cameras]\n"a b" = "/film.mp4"\n', "a b"),
         ('[cameras]\nusb = "video0"\n', "v4l2:/dev/video0"),
-        ('[cameras]\nusb = "v4l2:/dev/video0?width=1280"\n', "of usb: width and height are set together"),
-        ("[video]\nstreams = 0\n", "streams"),
-        ("[video]\nstreams = 17\n", "streams"),
-        ("[video]\ntarget_ms = 49\n", "target_ms"),
-        ("[video]\ntarget_ms = 5001\n", "target_ms"),
+        ('[cameras]\nusb = "v4l2:/dev/video0?width=1280"\n', "usb: set both width and height"),
+        ("[video]\nmax_streams = 0\n", "max_streams"),
+        ("[video]\nmax_streams = 17\n", "max_streams"),
+        ("[video]\ntarget_delay_ms = 49\n", "target_delay_ms"),
+        ("[video]\ntarget_delay_ms = 5001\n", "target_delay_ms"),
         ("[limits]\nlinear = 0\n", "linear"),
         ("[limits]\nviewer = { linear = 1 }\n", "viewer"),
         ("[limits.owner]\nlinar = 1\n", "linar"),
@@ -77,8 +74,7 @@ def test_lists_in_variables_have_commas() -> None:
         ('[[safety.topic]]\nname = "a b"\n', "a b"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
-    """An unknown key, a value out of range, or a text that is no TOML is named in the error."""
+def test_errors_name_the_wrong_setting(tmp_path: Path, text: str, named: str) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(text)
     with pytest.raises(Invalid, match=named):
@@ -86,47 +82,45 @@ def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
 
 
 def test_cameras_are_named_like_topics(tmp_path: Path) -> None:
-    """With a leading / or without; what they are is kept as it is written."""
+    """A leading / may be missing."""
     file = tmp_path / "robot.toml"
     file.write_text(
-        '[cameras]\nusb = "v4l2:/dev/video0"\n"/gate/left" = "rtsp://gate/1"\n[video]\nstreams = 3\ntarget_ms = 150\n'
+        '[cameras]\nusb = "v4l2:/dev/video0"\n"/gate/left" = "rtsp://gate/1"\n'
+        "[video]\nmax_streams = 3\ntarget_delay_ms = 150\n"
     )
     settings = load(file, {})
     assert settings.cameras == {"/usb": "v4l2:/dev/video0", "/gate/left": "rtsp://gate/1"}
-    assert (settings.video.streams, settings.video.target_ms) == (3, 150)
+    assert (settings.video.max_streams, settings.video.target_delay_ms) == (3, 150)
 
 
-def test_device_may_be_told_how_to_give_its_pictures(tmp_path: Path) -> None:
-    """It is read by whoever opens it, as it is written here."""
+def test_device_may_have_a_requested_format(tmp_path: Path) -> None:
     source = "v4l2:/dev/video0?width=1280&height=720&fps=30&format=MJPG"
     file = tmp_path / "robot.toml"
     file.write_text(f'[cameras]\nusb = "{source}"\n')
     assert load(file, {}).cameras == {"/usb": source}
 
 
-def test_address_of_a_camera_is_not_told(tmp_path: Path) -> None:
-    """It may hold a password, also where it is wrong."""
+def test_address_of_a_camera_is_not_reported(tmp_path: Path) -> None:
+    """It may contain a password."""
     file = tmp_path / "robot.toml"
     file.write_text('[cameras]\ngate = "RTSP://ann:s3cret@gate/1"\n')
-    with pytest.raises(Invalid, match="what gate") as caught:
+    with pytest.raises(Invalid, match="source of gate") as caught:
         load(file, {})
     assert "s3cret" not in str(caught.value)
 
 
 def test_unknown_variable_is_named() -> None:
-    """A variable of ours that is no setting is an error, with those that are."""
+    """With the known ones."""
     with pytest.raises(Invalid, match=r"SWITCHBOARD_ROBOT_SAFTY_GUARD.*SWITCHBOARD_ROBOT_SAFETY_GUARD"):
         load(None, {"SWITCHBOARD_ROBOT_SAFTY_GUARD": "1"})
 
 
-def test_missing_file_is_said(tmp_path: Path) -> None:
-    """A settings file that is not there is an error in words."""
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(Invalid, match="can't be read"):
         load(tmp_path / "none.toml", {})
 
 
-def test_short_spellings_of_motion_are_made_full() -> None:
-    """A type without its middle part and a topic without its slash count as what they mean."""
+def test_short_names_of_types_and_topics_are_completed() -> None:
     settings = load(
         None,
         {
@@ -152,8 +146,8 @@ def test_short_spellings_of_motion_are_made_full() -> None:
         ("goal_topics", "/goal_pose/"),
     ],
 )
-def test_motion_that_could_match_nothing_is_refused(tmp_path: Path, key: str, value: str) -> None:
-    """A type or topic that no robot can have is refused by name: it would leave the robot without a watchdog."""
+def test_types_and_topics_that_match_nothing_are_refused(tmp_path: Path, key: str, value: str) -> None:
+    """The robot would have no watchdog."""
     file = tmp_path / "robot.toml"
     file.write_text(f'[safety]\n{key} = ["{value}"]\n')
     with pytest.raises(Invalid, match=key):
@@ -161,7 +155,6 @@ def test_motion_that_could_match_nothing_is_refused(tmp_path: Path, key: str, va
 
 
 def test_simulated_time_is_a_setting(tmp_path: Path) -> None:
-    """``use_sim_time`` can be set in the file and by a variable, and is off by default."""
     file = tmp_path / "robot.toml"
     file.write_text("[ros]\nuse_sim_time = true\n")
     assert not load(None, {}).ros.use_sim_time
@@ -169,8 +162,8 @@ def test_simulated_time_is_a_setting(tmp_path: Path) -> None:
     assert load(None, {"SWITCHBOARD_ROBOT_ROS_USE_SIM_TIME": "true"}).ros.use_sim_time
 
 
-def test_a_topic_with_times_of_its_own_moves_the_robot(tmp_path: Path) -> None:
-    """What is left out is as for the robot; the topic is told as motion, once."""
+def test_topic_with_times_of_its_own_is_a_motion_topic(tmp_path: Path) -> None:
+    """Missing times are the robot's."""
     file = tmp_path / "robot.toml"
     file.write_text(
         '[safety]\nmotion_topics = ["/arm"]\n'
@@ -179,13 +172,12 @@ def test_a_topic_with_times_of_its_own_moves_the_robot(tmp_path: Path) -> None:
     )
     safety = load(file, {}).safety
     assert safety.policy.topics == ["/arm", "/gripper"]
-    assert safety.times("/arm") == Times(200, 500)
-    assert safety.times("/gripper") == Times(500, 100)
-    assert safety.times("/cmd_vel") == Times(500, 500)
+    assert safety.times("/arm") == CommandTimes(200, 500)
+    assert safety.times("/gripper") == CommandTimes(500, 100)
+    assert safety.times("/cmd_vel") == CommandTimes(500, 500)
 
 
 def test_limits_of_a_level_have_variables_too(tmp_path: Path) -> None:
-    """They beat the file, and a table that is none is named."""
     file = tmp_path / "robot.toml"
     file.write_text("[limits]\nlinear = 1\n[limits.operator]\nlinear = 0.5\nangular = 1.5\n")
     limits = load(file, {"SWITCHBOARD_ROBOT_LIMITS_OPERATOR_LINEAR": "0.25"}).limits
@@ -195,8 +187,8 @@ def test_limits_of_a_level_have_variables_too(tmp_path: Path) -> None:
         load(file, {"SWITCHBOARD_ROBOT_LIMITS_OPERATOR_LINEAR": "0.25"})
 
 
-def test_topics_without_limits_are_named_like_topics_that_move(tmp_path: Path) -> None:
-    """By name, with or without a slash, or by a pattern; in a variable with commas."""
+def test_exempt_topics_are_given_like_motion_topics(tmp_path: Path) -> None:
+    """By name or pattern."""
     file = tmp_path / "robot.toml"
     file.write_text('[limits]\nlinear = 1\nunlimited = ["joy", "*/arm"]\n')
     assert rules_of(load(file, {})).unlimited == ["/joy", "*/arm"]
@@ -206,13 +198,11 @@ def test_topics_without_limits_are_named_like_topics_that_move(tmp_path: Path) -
 
 
 def test_tables_have_no_variables() -> None:
-    """A list of tables can't be written into one."""
-    with pytest.raises(Invalid, match="SAFETY_TOPIC is no setting"):
+    with pytest.raises(Invalid, match="SAFETY_TOPIC is not a setting"):
         load(None, {"SWITCHBOARD_ROBOT_SAFETY_TOPIC": "/arm"})
 
 
 def test_motion_may_be_named_by_patterns(tmp_path: Path) -> None:
-    """Topics, services and actions that move the robot, by name or by pattern; without settings the usual actions."""
     file = tmp_path / "robot.toml"
     file.write_text(
         '[safety]\nmotion_topics = ["arm/*", "*/cmd_vel"]\nmotion_services = ["/gripper/[oc]*"]\n'
@@ -229,7 +219,7 @@ def test_motion_may_be_named_by_patterns(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("namespace", ["", "/robot1", "/fleet/robot1"])
 def test_actions_of_nav2_move_the_robot_in_every_namespace(namespace: str) -> None:
-    """Those that drive it, without any settings; those that only compute or wait do not."""
+    """Not those that only compute or wait."""
     policy = load(None, {}).safety.policy
     for name in [
         "navigate_to_pose",
@@ -252,22 +242,21 @@ def test_actions_of_nav2_move_the_robot_in_every_namespace(namespace: str) -> No
         assert not policy.moves_by_action(f"{namespace}/{name}")
 
 
-def test_goal_topics_are_told_as_motion_but_not_stopped_by_zero(tmp_path: Path) -> None:
-    """The relay asks for control; what says zero does not know of them. They are a setting of their own."""
+def test_goal_topics_are_reported_as_motion_but_not_stopped_by_zero(tmp_path: Path) -> None:
     safety = load(None, {}).safety
     for name in ("/goal_pose", "/robot1/goal_pose"):
-        assert safety.told.moves_by_topic(name, POSE)
+        assert safety.reported_policy.moves_by_topic(name, POSE)
         assert not safety.policy.moves_by_topic(name, POSE)
-    assert not safety.told.moves_by_topic("/initialpose", POSE)
-    assert (safety.told.actions, safety.told.types) == (safety.policy.actions, safety.policy.types)
+    assert not safety.reported_policy.moves_by_topic("/initialpose", POSE)
+    reported, own = safety.reported_policy, safety.policy
+    assert (reported.actions, reported.types) == (own.actions, own.types)
     file = tmp_path / "robot.toml"
     file.write_text('[safety]\nmotion_topics = ["/arm"]\ngoal_topics = ["arm", "target"]\n')
-    assert load(file, {}).safety.told.topics == ["/arm", "/target"]
+    assert load(file, {}).safety.reported_policy.topics == ["/arm", "/target"]
 
 
-def test_settings_of_the_readme_lose_no_default(tmp_path: Path) -> None:
-    """Whoever copies the example as it stands has all that moves by default."""
-    text = (Path(__file__).parents[2] / "README.md").read_text()
+def test_example_settings_keep_all_defaults(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs/operate/robot_settings.md").read_text()
     example = next(each for each in re.findall(r"```toml\n(.*?)```", text, re.DOTALL) if "[safety]" in each)
     file = tmp_path / "robot.toml"
     file.write_text(example)
@@ -276,17 +265,26 @@ def test_settings_of_the_readme_lose_no_default(tmp_path: Path) -> None:
         assert getattr(shown, key) == getattr(default, key)
 
 
-def test_switches_of_the_hardware_are_settings() -> None:
-    """The service and the programs that stop the hardware; a program is named by its whole path."""
+def test_hardware_switches_are_settings() -> None:
+    """Programs need an absolute path."""
     settings = load(
         None,
         {
-            "SWITCHBOARD_ROBOT_SAFETY_STOP_CALL": "estop",
+            "SWITCHBOARD_ROBOT_SAFETY_STOP_SERVICE": "estop",
             "SWITCHBOARD_ROBOT_SAFETY_STOP_COMMAND": "/usr/bin/relay, off",
         },
     )
     assert tuple(settings.safety.switches) == ("/estop", ["/usr/bin/relay", "off"], [])
     with pytest.raises(Invalid, match="stop_command"):
         load(None, {"SWITCHBOARD_ROBOT_SAFETY_STOP_COMMAND": "relay,off"})
-    with pytest.raises(Invalid, match="stop_call"):
-        load(None, {"SWITCHBOARD_ROBOT_SAFETY_STOP_CALL": "e stop"})
+    with pytest.raises(Invalid, match="stop_service"):
+        load(None, {"SWITCHBOARD_ROBOT_SAFETY_STOP_SERVICE": "e stop"})
+
+
+def test_directories_of_assets_are_absolute_paths() -> None:
+    assert load(None, {}).assets.roots == []
+    name = "SWITCHBOARD_ROBOT_ASSETS_ROOTS"
+    assert load(None, {name: "/ws/src, /opt/meshes/"}).assets.roots == ["/ws/src", "/opt/meshes/"]
+    for wrong in ("src", "~/ws/src", "/ws/../etc", "/", "//", "/.", "/a\0b"):
+        with pytest.raises(Invalid, match="must be the absolute path of a directory"):
+            load(None, {name: f"/ws/src,{wrong}"})

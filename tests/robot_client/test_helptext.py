@@ -1,4 +1,4 @@
-"""What the robot's commands say about themselves."""
+"""The help texts of the robot's commands."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from robot_client.sim.main import main as simulate
         (["switchboard-sim"], simulate),
     ],
 )
-def test_help_ends_with_examples_that_are_understood(words: list[str], command: click.Command) -> None:
-    """Each line is a command as it is typed, with options that exist."""
+def test_examples_in_help_texts_are_valid_commands(words: list[str], command: click.Command) -> None:
     known = {"enroll": enroll, "run": run}
     shown = CliRunner().invoke(command, [*words[1:], "--help"], prog_name=words[0])
     assert shown.exit_code == 0

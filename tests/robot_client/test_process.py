@@ -16,14 +16,14 @@ import pytest
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Joy
-from switchboard_pulse import Pulse
-from switchboard_waiting import freeze
 
 from relay_protocol import link
-from tests.robot_client.fake_relay import FakeRelay, Peer
 from tests.robot_client.robot_process import Robot, until
 from tests.robot_client.ros import PATIENCE
 from tests.robot_client.ros import Peer as Node
+from tests.worlds.fake_relay import FakeRelay, Peer
+from tests.worlds.machine_pauses import Pulse
+from tests.worlds.waiting import freeze
 
 TWIST = "geometry_msgs/msg/Twist"
 MS = 1_000_000
@@ -64,9 +64,9 @@ def enrolled(robot: Robot) -> Robot:
 
 
 class Drive:
-    """A daemon on a channel, with its guard up and a node that listens.
+    """A daemon on a channel, with its guard running and a listening node.
 
-    :param pulse: of the machine, whose standing still is nobody's fault
+    :param pulse: of the machine, whose stalls do not count
     """
 
     def __init__(self, robot: Robot, node: Node, pulse: Pulse) -> None:
@@ -80,19 +80,19 @@ class Drive:
         self.heard_by_node()
 
     def take(self) -> None:
-        """Take the robot in, give control to source 1, and open a channel."""
+        """Registers the robot, grants control to source 1, and opens a channel."""
         self.control = self.robot.relay.register()
-        assert self.control.order(link.Control(id=1, holder=1, user="ann")).ok
+        assert self.control.order(link.ControlGrant(id=1, holder=1, user="ann")).ok
         self.channel = self.open()
 
     def open(self) -> Peer:
         channel = self.robot.relay.channel(self.control)
-        channel.say(link.Advertise(number=5, topic="/cmd_vel", type=TWIST, source="test"))
+        channel.send(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
         assert channel.expect(link.Advertised).motion
         return channel
 
     def heard_by_node(self) -> None:
-        """Drive until both the node and the guard have found each other."""
+        """Drives until both the node and the guard are matched."""
         start = len(self.node.heard("/cmd_vel"))
         until(lambda: self.channel.command(5, GO) or len(self.node.heard("/cmd_vel")) > start)
         self.channel.command(5, command(0.0))
@@ -105,17 +105,16 @@ class Drive:
         return cmdline[cmdline.index("--node") + 1] in known[-1]
 
     def drive(self) -> int:
-        """Drive for half a second; when the last command was heard, nanoseconds."""
+        """Drives for half a second; returns when the last command arrived, nanoseconds."""
         self._lost = self._pulse.lost()
         for _ in range(10):
             self.channel.command(5, GO)
-            time.sleep(0.05)  # the pace of a driver
+            time.sleep(0.05)  # the driver's rate
         return int(self.node.heard("/cmd_vel")[-1]["at"])
 
     def zero_after(self, since: int) -> float:
-        """Wait for the first zero after a moment; how long after it, milliseconds.
-
-        For as long as the machine stood still since the drive began nothing is counted.
+        """Waits for the first zero after a time; returns the delay in milliseconds, without stalls of the
+        whole machine.
         """
 
         def zeros() -> list[int]:
@@ -129,6 +128,7 @@ class Drive:
 
 @pytest.fixture
 def drive(enrolled: Robot, node: Node) -> Iterator[Drive]:
+    """Drives for half a second; returns when the last command arrived, nanoseconds."""
     with Pulse() as pulse:
         yield Drive(enrolled, node, pulse)
 
@@ -141,8 +141,7 @@ what is tested here there would be no zero at all.
 """
 
 
-def test_enrolment_sends_the_code_and_keeps_the_key(robot: Robot) -> None:
-    """Enrolling sends code and public key, and leaves a private key for its owner alone."""
+def test_enrolment_sends_the_code_and_stores_the_key(robot: Robot) -> None:
     robot.enroll()
     assert (robot.asked.robot, robot.asked.code) == ("r1", "code-1")
     assert len(robot.relay.public_key) == 32
@@ -150,48 +149,43 @@ def test_enrolment_sends_the_code_and_keeps_the_key(robot: Robot) -> None:
     assert robot.relay.public_key not in (robot.state / "robot.key").read_bytes()
 
 
-def test_refused_enrolment_says_why_and_leaves_nothing(robot: Robot) -> None:
-    """A refused code ends with exit code 1, the relay's words made harmless, and no state."""
+def test_refused_enrolment_gives_the_reason_and_leaves_nothing(robot: Robot) -> None:
+    """Exit code 1; the relay's text is escaped."""
     process = robot.start("enroll", "--relay", robot.relay.address, "--robot", "r1", "--code", "old")
     peer = robot.relay.accept()
     peer.expect(link.Enroll)
-    peer.say(link.Refused(reason="this code was used \x1b[31malready"))
+    peer.send(link.Refused(reason="this code was used \x1b[31malready"))
     assert process.wait(PATIENCE) == 1
     assert r"this code was used \x1b[31malready" in robot.log.read_text()
     assert not robot.state.exists()
 
 
-def test_second_enrolment_needs_a_word(enrolled: Robot) -> None:
-    """An enrolled folder is not overwritten by accident."""
+def test_second_enrolment_needs_replace(enrolled: Robot) -> None:
     process = enrolled.start("enroll", "--relay", enrolled.relay.address, "--robot", "r2", "--code", "x")
     assert process.wait(PATIENCE) == 1
     assert "--replace" in enrolled.log.read_text()
 
 
-def test_unreachable_relay_is_said(robot: Robot) -> None:
-    """Enrolling where nobody listens ends in words."""
+def test_unreachable_relay_is_reported(robot: Robot) -> None:
     robot.relay.close()
     process = robot.start("enroll", "--relay", robot.relay.address, "--robot", "r1", "--code", "x")
     assert process.wait(PATIENCE) == 1
-    assert "nobody listens" in robot.log.read_text()
+    assert "refuses connections" in robot.log.read_text()
     assert not robot.state.exists()
 
 
-def test_run_without_enrolment_says_what_to_do(robot: Robot) -> None:
-    """A robot that is not enrolled is told how to be."""
+def test_run_without_an_enrolment_names_the_command(robot: Robot) -> None:
     assert robot.run().wait(PATIENCE) == 1
     assert "switchboard-robot enroll" in robot.log.read_text()
 
 
-def test_wrong_settings_are_named(enrolled: Robot, tmp_path: Path) -> None:
-    """An unknown key in the settings file ends the run with its name."""
+def test_unknown_setting_is_named(enrolled: Robot, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text("[safety]\nstop_after = 3\n")
     assert enrolled.run("--config", str(tmp_path / "c.toml")).wait(PATIENCE) == 1
     assert "stop_after" in enrolled.log.read_text()
 
 
-def test_daemon_registers_and_tells(enrolled: Robot) -> None:
-    """A daemon that runs proves its key, describes a ROS 2 robot, and says so in its log."""
+def test_daemon_registers_and_describes_the_robot(enrolled: Robot) -> None:
     enrolled.run("--log-json")
     control = enrolled.relay.register()
     assert control.expect(link.Describe).platform == "ros2"
@@ -202,18 +196,17 @@ def test_daemon_registers_and_tells(enrolled: Robot) -> None:
     assert "registered as r1 at relay-1" in [each["text"] for each in lines]
 
 
-def test_relay_that_restarts_has_its_robot_back(enrolled: Robot) -> None:
-    """A relay that is killed and comes back on its port has the robot registered again soon."""
+def test_robot_registers_again_at_a_restarted_relay(enrolled: Robot) -> None:
     enrolled.run()
     enrolled.relay.register()
     enrolled.relay.close()
-    time.sleep(1.0)  # the robot dials in vain meanwhile
+    time.sleep(1.0)  # the robot's attempts to connect fail meanwhile
     enrolled.relay.open()
     enrolled.relay.register()
 
 
 def test_other_relay_is_refused(enrolled: Robot) -> None:
-    """A relay with another name at the same address gets no proof, and the log says why."""
+    """It gets no proof, and the log gives the reason."""
     enrolled.relay.name = "relay-2"
     enrolled.run()
     peer = enrolled.relay.accept()
@@ -230,8 +223,8 @@ def test_other_relay_is_refused(enrolled: Robot) -> None:
         (b"\0\0\0\x06\x09hello", "frame kind 9"),
     ],
 )
-def test_hostile_relay_is_cut(enrolled: Robot, data: bytes, words: str) -> None:
-    """A frame over the limit, no UTF-8, an unknown kind: the link ends in words, the daemon goes on."""
+def test_protocol_violations_end_the_link(enrolled: Robot, data: bytes, words: str) -> None:
+    """A frame over the limit, invalid UTF-8, an unknown kind; the daemon continues."""
     enrolled.run()
     control = enrolled.relay.register()
     control.raw(data)
@@ -241,33 +234,30 @@ def test_hostile_relay_is_cut(enrolled: Robot, data: bytes, words: str) -> None:
     enrolled.relay.register()
 
 
-def test_silence_of_the_client_stops(drive: Drive) -> None:
-    """When commands cease on a living link the robot has its zero in time."""
+def test_robot_stops_when_commands_end(drive: Drive) -> None:
     assert drive.zero_after(drive.drive()) < STOP_MS
 
 
-def test_lost_channel_stops(drive: Drive) -> None:
-    """When the channel's connection is cut the robot has its zero in time."""
+def test_robot_stops_when_its_channel_is_lost(drive: Drive) -> None:
     last = drive.drive()
     drive.channel.cut()
     assert drive.zero_after(last) < STOP_MS
 
 
-def test_killed_daemon_stops(drive: Drive) -> None:
-    """kill -9 of the daemon: its guard sends zero in time, then leaves."""
+def test_guard_stops_the_robot_of_a_killed_daemon(drive: Drive) -> None:
+    """Then it exits."""
     last = drive.drive()
     drive.process.kill()
     assert drive.zero_after(last) < STOP_MS
     until(lambda: not drive.guard.is_running())
 
 
-def test_guard_goes_before_others_where_it_may(drive: Drive) -> None:
-    """Its priority is raised, unless its user is not allowed to."""
+def test_guard_has_a_raised_priority_where_permitted(drive: Drive) -> None:
     assert drive.guard.nice() == (-10 if _may_be_raised() else os.getpriority(os.PRIO_PROCESS, 0))
 
 
 def _may_be_raised() -> bool:
-    """Whether processes of this user may have such a priority; tried by a thread, which is one to Linux."""
+    """Whether processes of this user may have such a priority; tried by a thread, as Linux sets it per thread."""
 
     def attempt() -> bool:
         try:
@@ -280,10 +270,9 @@ def _may_be_raised() -> bool:
         return one.submit(attempt).result()
 
 
-def test_killed_daemon_lets_go_of_a_joystick(drive: Drive) -> None:
-    """The guard's zero has as many axes and buttons as the last command had."""
+def test_guard_publishes_a_joystick_zero_of_the_same_shape(drive: Drive) -> None:
     drive.node.do("listen", "/joy", "joy")
-    drive.channel.say(link.Advertise(number=6, topic="/joy", type="sensor_msgs/msg/Joy"))
+    drive.channel.send(link.Advertise(number=6, topic="/joy", type="sensor_msgs/msg/Joy"))
     assert drive.channel.expect(link.Advertised).motion
     body = bytes(serialize_message(Joy(axes=[0.5, 0.0, -1.0], buttons=[1, 0])))
     until(lambda: drive.channel.command(6, body) or drive.node.heard("/joy"))
@@ -295,23 +284,23 @@ def test_killed_daemon_lets_go_of_a_joystick(drive: Drive) -> None:
     until(lambda: not drive.guard.is_running())
 
 
-def test_frozen_daemon_stops(drive: Drive) -> None:
-    """SIGSTOP of the daemon: its guard sends zero in time; what waited in the frozen daemon is not executed."""
+def test_guard_stops_the_robot_of_a_frozen_daemon(drive: Drive) -> None:
+    """Commands that waited in the frozen daemon are not executed."""
     last = drive.drive()
     freeze(drive.process.pid)
     for _ in range(5):
         drive.channel.command(5, GO)
     assert drive.zero_after(last) < STOP_MS
-    time.sleep(1.0)  # the commands grow old
+    time.sleep(1.0)  # the commands expire
     thawed = time.monotonic_ns()
     drive.process.send_signal(signal.SIGCONT)
     drive.control.expect(link.Health)
-    time.sleep(0.5)  # proves absence
+    time.sleep(0.5)  # shows absence
     assert [each for each in drive.node.heard("/cmd_vel") if each["at"] > thawed and each["x"] != 0.0] == []
 
 
-def test_sigterm_stops_and_leaves(drive: Drive) -> None:
-    """SIGTERM while driving: zero, goodbye, exit 0 within seconds, no guard left."""
+def test_sigterm_stops_the_robot_and_the_processes(drive: Drive) -> None:
+    """Exit code 0 within seconds."""
     last = drive.drive()
     with Pulse() as pulse:
         begun = time.monotonic()
@@ -323,16 +312,14 @@ def test_sigterm_stops_and_leaves(drive: Drive) -> None:
     until(lambda: not drive.guard.is_running())
 
 
-def test_old_commands_are_not_executed(drive: Drive) -> None:
-    """A command over its deadline, or stamped in the future, moves nothing and is counted."""
+def test_stale_and_future_commands_are_refused_and_counted(drive: Drive) -> None:
     drive.channel.command(5, command(0.7), age=0.6)
     drive.channel.command(5, command(0.7), age=-0.6)
     until(lambda: drive.control.expect(link.Health).stale_commands >= 2)
     assert 0.7 not in [each["x"] for each in drive.node.heard("/cmd_vel")]
 
 
-def test_dead_guard_is_replaced_and_told(drive: Drive) -> None:
-    """A guard that is killed is an alert, and another one takes its place and does its work."""
+def test_killed_guard_is_restarted_and_raises_an_alert(drive: Drive) -> None:
     drive.guard.kill()
     alert = drive.control.expect(link.Alert)
     assert "guard" in alert.text
@@ -345,40 +332,38 @@ def test_dead_guard_is_replaced_and_told(drive: Drive) -> None:
     until(lambda: not drive.guard.is_running())
 
 
-def test_idle_guard_costs_nothing(drive: Drive) -> None:
-    """A guard with nothing to guard uses no measurable processor time of its own code."""
+def test_idle_guard_uses_no_processor_time(drive: Drive) -> None:
     before = sum(drive.guard.cpu_times()[:2])
-    time.sleep(2.0)  # the time it is measured over
+    time.sleep(2.0)  # the time of the measurement
     assert sum(drive.guard.cpu_times()[:2]) - before < 0.2
     assert os.getsid(drive.guard.pid) != os.getsid(drive.process.pid)
 
 
-def test_frozen_guard_lets_nothing_move(drive: Drive) -> None:
-    """While the guard is frozen commands are held back, so that the robot stands; when it is back they pass again."""
+def test_no_command_passes_while_the_guard_is_frozen(drive: Drive) -> None:
     drive.drive()
     drive.guard.suspend()
     try:
         held_back = time.monotonic() + PATIENCE
         while not drive.channel.command(5, GO) and drive.node.heard("/cmd_vel")[-1]["x"] != 0.0:
             assert time.monotonic() < held_back
-            time.sleep(0.05)  # the pace of a driver
+            time.sleep(0.05)  # the driver's rate
         stood = len(drive.node.heard("/cmd_vel"))
         for _ in range(10):
             drive.channel.command(5, GO)
-            time.sleep(0.05)  # the pace of a driver
+            time.sleep(0.05)  # the driver's rate
         assert {each["x"] for each in drive.node.heard("/cmd_vel")[stood:]} <= {0.0}
     finally:
         drive.guard.resume()
     until(lambda: drive.channel.command(5, GO) or drive.node.heard("/cmd_vel")[-1]["x"] != 0.0)
 
 
-def test_wrong_type_before_the_driver_is_up_does_no_harm(drive: Drive) -> None:
-    """A topic advertised with the wrong type is driven by the right one later, and the guard can stop it."""
-    drive.channel.say(link.Advertise(number=6, topic="/base", type="geometry_msgs/msg/TwistStamped"))
+def test_topic_advertised_with_a_wrong_type_can_be_driven_later(drive: Drive) -> None:
+    """The guard can stop it."""
+    drive.channel.send(link.Advertise(number=6, topic="/base", type="geometry_msgs/msg/TwistStamped"))
     assert drive.channel.expect(link.Advertised).motion
-    drive.channel.say(link.Unadvertise(number=6))
+    drive.channel.send(link.Unadvertise(number=6))
     drive.node.do("listen", "/base", "twist")
-    drive.channel.say(link.Advertise(number=7, topic="base", type="geometry_msgs/Twist"))
+    drive.channel.send(link.Advertise(number=7, topic="base", type="geometry_msgs/Twist"))
     assert drive.channel.expect(link.Advertised).motion
     until(lambda: drive.channel.command(7, GO) or drive.node.heard("/base"))
     drive.process.kill()
@@ -386,8 +371,7 @@ def test_wrong_type_before_the_driver_is_up_does_no_harm(drive: Drive) -> None:
     until(lambda: not drive.guard.is_running())
 
 
-def test_simulated_time_is_told(enrolled: Robot, relay: FakeRelay) -> None:
-    """With ``--use-sim-time`` the relay hears that the robot's time is simulated, and the guard is told too."""
+def test_simulated_time_is_reported(enrolled: Robot, relay: FakeRelay) -> None:
     process = enrolled.run("--use-sim-time")
     control = relay.register()
     assert control.expect(link.Describe).sim_time is True
@@ -395,8 +379,7 @@ def test_simulated_time_is_told(enrolled: Robot, relay: FakeRelay) -> None:
     assert "--sim-time" in enrolled.guards(process)[0].cmdline()
 
 
-def test_killed_while_stopped_it_never_moves_again(drive: Drive) -> None:
-    """kill -9 right after a stop: the next daemon is stopped from its first moment, until somebody resumes it."""
+def test_daemon_killed_after_a_stop_starts_stopped(drive: Drive) -> None:
     drive.drive()
     assert drive.control.order(link.Stop(id=2, by="eve", why="test")).ok
     drive.process.kill()
@@ -405,27 +388,28 @@ def test_killed_while_stopped_it_never_moves_again(drive: Drive) -> None:
     since = time.monotonic_ns()
     drive.process = drive.robot.run()
     drive.take()
-    stopped = drive.control.expect(link.Safety).stopped
+    # It was sent when the robot registered, before the order was answered.
+    stopped = next(each for each in drive.control.skipped if isinstance(each, link.MotionState)).stopped
     assert stopped is not None
     assert (stopped.by, stopped.why) == ("eve", "test")
     for _ in range(20):
         drive.channel.command(5, GO)
-        time.sleep(0.05)  # the pace of a driver
+        time.sleep(0.05)  # the driver's rate
     assert [each for each in drive.node.heard("/cmd_vel") if each["at"] > since and each["x"] != 0.0] == []
     assert drive.control.order(link.Resume(id=3, by="ann")).ok
-    time.sleep(0.8)  # lets go
+    time.sleep(0.8)  # a pause counts as a release
     drive.guard = drive.robot.guards(drive.process)[0]
     drive.heard_by_node()
 
 
-def test_stop_while_driving_is_zero_at_once(drive: Drive) -> None:
-    """Commands that go on come to nothing: what is heard after the answer is zero alone."""
+def test_stop_while_driving_publishes_zero_at_once(drive: Drive) -> None:
+    """Later commands are refused."""
     drive.drive()
     assert drive.control.order(link.Stop(id=2, by="eve")).ok
-    told = time.monotonic_ns()
+    reported = time.monotonic_ns()
     for _ in range(10):
         drive.channel.command(5, GO)
-        time.sleep(0.05)  # the pace of a driver
-    settled = told + 100 * MS  # what was published before the answer is on its way
+        time.sleep(0.05)  # the driver's rate
+    settled = reported + 100 * MS  # earlier messages are still under way
     assert [each for each in drive.node.heard("/cmd_vel") if each["at"] > settled and each["x"] != 0.0] == []
     assert drive.control.order(link.Resume(id=3, by="eve")).ok

@@ -1,7 +1,8 @@
-"""Signs of life for systemd."""
+"""Notifications to systemd."""
 
 from __future__ import annotations
 
+import re
 import socket
 from pathlib import Path
 
@@ -10,8 +11,7 @@ from twisted.internet.task import Clock
 from robot_client.systemd import Notifier
 
 
-def test_systemd_hears_ready_alive_leaving(tmp_path: Path) -> None:
-    """The daemon says it is ready, gives a sign of life twice per watchdog time while healthy, and says it leaves."""
+def test_systemd_gets_ready_watchdog_stopping(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     clock, healthy = Clock(), [True]
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -40,10 +40,19 @@ def test_systemd_hears_ready_alive_leaving(tmp_path: Path) -> None:
         assert heard() == [b"STOPPING=1"]
 
 
-def test_without_systemd_nothing_is_said() -> None:
-    """Without systemd's variables nothing is scheduled or sent."""
+def test_without_systemd_nothing_is_sent() -> None:
     clock = Clock()
     notifier = Notifier(clock, {}, lambda: True)
     notifier.start()
     assert clock.getDelayedCalls() == []
     notifier.stop()
+
+
+def test_unit_lets_modules_outlive_the_daemon_and_open_the_devices_of_the_documents() -> None:
+    root = Path(__file__).parents[2]
+    unit = (root / "deploy" / "switchboard-robot.service").read_text()
+    settings = [line.partition("=")[::2] for line in unit.splitlines() if "=" in line and line[0] != "#"]
+    assert dict(settings)["KillMode"] == "process"
+    documents = "".join((root / "docs/guides" / name).read_text() for name in ("modules.md", "devices.md"))
+    named = {f"char-{kind} rw" for kind in re.findall(r"/dev/(tty[A-Z]+)\d", documents)}
+    assert named and named <= {value for name, value in settings if name == "DeviceAllow"}

@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from switchboard_domains import free_domain
+
+from tests.worlds.ros_domains import free_domain
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "build_interfaces.py"
 PACKAGE = "built_for_test_interfaces"
@@ -81,7 +82,9 @@ def package(tmp_path: Path) -> Path:
 
 
 def test_message_service_and_action_work_in_a_node(tmp_path: Path, package: Path) -> None:
-    """Built types go through the middleware; a second build finds them up to date; a change builds anew."""
+    """Built types pass through the middleware; a second build finds them up to date; a change causes a new
+    build.
+    """
     prefix = tmp_path / "prefix"
     built = run(prefix, str(SCRIPT), "--prefix", str(prefix), str(package))
     assert built.returncode == 0, built.stderr
@@ -95,8 +98,8 @@ def test_message_service_and_action_work_in_a_node(tmp_path: Path, package: Path
     assert f"{PACKAGE} is built" in changed.stdout, changed.stderr
 
 
-def test_a_folder_without_interfaces_is_told(tmp_path: Path) -> None:
-    """The reason is one sentence, not a traceback."""
+def test_a_folder_without_interfaces_is_reported(tmp_path: Path) -> None:
+    """The reason is one line, not a traceback."""
     done = run(tmp_path, str(SCRIPT), "--prefix", str(tmp_path), str(tmp_path))
     assert done.returncode == 1
     assert "holds no msg/*.msg" in done.stderr

@@ -1,4 +1,4 @@
-"""What ``make house`` counts, on small packages made for it."""
+"""The counts of ``make house``, on small packages made for it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 @pytest.fixture
 def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The script, with one empty package at a place of its own."""
+    """The script, with an empty package."""
     spec = importlib.util.spec_from_file_location("house", Path("scripts/house.py").resolve())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -19,7 +19,7 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     spec.loader.exec_module(module)
     for package in ("relay_server", "robot_client"):
         (tmp_path / package).mkdir()
-    (tmp_path / "relay_server/service.py").write_text("")
+    (tmp_path / "relay_server/relay.py").write_text("")
     monkeypatch.setattr(module, "ROOT", tmp_path)
     packages = {name: tmp_path / name for name in ("relay_server", "robot_client")}
     monkeypatch.setattr(module, "PACKAGES", packages)
@@ -27,7 +27,7 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def write(house: ModuleType, name: str, text: str) -> None:
-    """Write a module of the packages."""
+    """Writes a module of the packages."""
     (house.ROOT / name).write_text(text)
 
 
@@ -70,3 +70,25 @@ def test_a_count_over_its_limit_fails_and_is_listed(
     monkeypatch.setitem(house.LIMITS, "private names", 0)
     assert house.main([]) == 1
     assert "relay_server.a.Desk" in capsys.readouterr().out
+
+
+def test_prose_is_counted(house: ModuleType) -> None:
+    long = " ".join(["word"] * 31)
+    pages = {
+        "README.md": f"# What it is\n\n{long.capitalize()}. What it does is a test.\n\n- Who is there?\n",
+        "docs/page.md": f"```sh\nWhat is code.\n{'x' * 101}\n```\n\n| A | {long} |\n\n{'y' * 101}\n",
+        "docs/written.md": f"# T\n\n{house.GENERATED}x.py -->\n\nWhoever reads this. {'z' * 101}\n",
+    }
+    (house.ROOT / "docs").mkdir()
+    for name, text in pages.items():
+        write(house, name, text)
+    counts, details = house.prose()
+    assert counts["lines of README.md"] == 5
+    assert counts["sentences over 30 words, per cent"] == 50
+    assert details["sentences that begin with Who or What"] == ["README.md: What it does is a test."]
+    assert details["lines of documents over 100 characters"] == [
+        "README.md:3 (179)",
+        "docs/page.md:3 (101)",
+        "docs/page.md:8 (101)",
+    ]
+    assert counts["characters of the widest row of a table"] == len(f"| A | {long} |")

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from switchboard_browser import chromium, portal, sound_pages
-from switchboard_processes import Process
+
+from tests.worlds.browser import checked_pages, chromium, open_session, portal
+from tests.worlds.processes import Process
 
 HERE = Path(__file__).parent
 PASSWORD = "correct horse"
@@ -35,13 +36,13 @@ class FakeRelay:
         urllib.request.urlopen(urllib.request.Request(self.url + "/fake/do", data, method="POST")).close()
 
     def log(self, **wanted: Any) -> list[Json]:
-        """What pages sent so far, in order, narrowed to messages with these values."""
+        """Messages of pages so far, in order, filtered by these values."""
         with urllib.request.urlopen(self.url + "/fake/log") as answer:
             entries: list[Json] = json.load(answer)
         return [entry for entry in entries if all(entry.get(key) == value for key, value in wanted.items())]
 
     def until(self, ready: Callable[[], Any], what: str) -> Any:
-        """Polls until something is true, and fails with ``what`` if it never is."""
+        """Polls until a condition is true, and fails with ``what`` otherwise."""
         deadline = time.monotonic() + WAIT_SECONDS
         while not (found := ready()):
             if time.monotonic() > deadline:
@@ -57,13 +58,23 @@ class FakeRelay:
         ]
 
 
-@pytest.fixture
-def relay(tmp_path: Path) -> Iterator[FakeRelay]:
-    process = Process([str(HERE / "fake_relay.py"), "--portal", str(portal())], tmp_path, "fake-relay")
+def run_relay(folder: Path) -> Iterator[FakeRelay]:
+    process = Process([str(HERE / "fake_relay.py"), "--portal", str(portal())], folder, "fake-relay")
     try:
         yield FakeRelay(f"http://127.0.0.1:{process.wait_to_say('READY').split()[1]}")
     finally:
         process.stop()
+
+
+@pytest.fixture
+def relay(tmp_path: Path) -> Iterator[FakeRelay]:
+    yield from run_relay(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def shared_relay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeRelay]:
+    """One for all tests of a file."""
+    yield from run_relay(tmp_path_factory.mktemp("relay"))
 
 
 @pytest.fixture(scope="module")
@@ -77,20 +88,15 @@ OpenPage = Callable[..., Page]
 
 @pytest.fixture
 def open_page(browser: Browser, relay: FakeRelay) -> Iterator[OpenPage]:
-    """Opens pages of the portal; fails the test if any of them had an uncaught error or broke the CSP."""
-    with sound_pages(browser, relay.url, WAIT_SECONDS) as new_page:
+    """Opens pages of the portal; an uncaught error or a violation of the CSP in any of them fails the test."""
+    with checked_pages(browser, relay.url, WAIT_SECONDS) as new_page:
 
         def open_page(
             path: str = "/", width: int = 1280, height: int = 800, user: str | None = None, **options: Any
         ) -> Page:
             page = new_page(width, height, **options)
             if user is not None:
-                answer = page.request.post(
-                    "/api/v1/session",
-                    data={"user": user, "password": PASSWORD},
-                    headers={"X-Requested-With": "switchboard"},
-                )
-                assert answer.ok, answer.text()
+                open_session(page, user, PASSWORD)
             page.goto(path)
             return page
 

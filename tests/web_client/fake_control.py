@@ -1,4 +1,4 @@
-"""Who controls the fake relay's robots, what is stopped, and its alerts: enough for the portal's own tests."""
+"""Control, stops and alerts of the fake relay's robots, as far as the portal's tests need them."""
 
 from __future__ import annotations
 
@@ -33,9 +33,11 @@ class Control:
         self.implicit = False
         self.away = False
         self.denial = ""
+        self.fault = ""
+        """What the robot can't do of a stop."""
 
-    def told(self, client: Any) -> Json:
-        """What ``/relay/control`` says to one client."""
+    def reported(self, client: Any) -> Json:
+        """The content of ``/relay/control`` for one client."""
         request = self._person(self.request, client, self.asked)
         if request is not None:
             request |= {"why": self.why, "until": self.asked + self.grace}
@@ -68,11 +70,13 @@ class Control:
         """One of the services below ``/relay/``."""
         success, message = getattr(self, order)(client, why)
         self.changed()
-        done = {"done": not self.away} if order == "stop" else {}
+        done = {"done": success and not self.away, "stopped": self.stopped} if order == "stop" else {}
         return {"success": success, "message": message, **done}
 
     def take_control(self, client: Any, why: str) -> tuple[bool, str]:
-        """Free: taken. Held: asked for, or by an owner who waited long enough taken over."""
+        """A free robot is taken. A controlled one is requested, or taken over by an owner who waited long
+        enough.
+        """
         if client.level == "viewer":
             return False, f"{client.user} may not control {self.robot}"
         if self.denial:
@@ -87,7 +91,7 @@ class Control:
         return False, f"{self.holder.user} has control and was asked for it"
 
     def release_control(self, client: Any, why: str) -> tuple[bool, str]:
-        """Give back control, or a request."""
+        """Releases control, or withdraws a request."""
         if client is self.request:
             self.request = None
         elif client is self.holder:
@@ -95,41 +99,47 @@ class Control:
         return True, ""
 
     def grant_control(self, client: Any, why: str) -> tuple[bool, str]:
-        """The holder's yes."""
+        """The holder grants it."""
         if client is not self.holder or self.request is None:
-            return False, "nobody asks for control"
+            return False, "there is no request for control"
         self.holder, self.request, self.since = self.request, None, time.time()
         return True, ""
 
     def refuse_control(self, client: Any, why: str) -> tuple[bool, str]:
-        """The holder's no."""
+        """The holder refuses it."""
         if client is not self.holder:
             return False, "you have no control of this robot"
         self.request = None
         return True, ""
 
     def stop(self, client: Any, why: str) -> tuple[bool, str]:
-        """For everybody."""
-        self.halt(client.user, why, told=not self.away)
+        """For all users."""
+        self.halt(client.user, why, confirmed=not self.away and not self.fault)
+        if self.fault:
+            return False, f"robot {self.robot} is stopped, but a part of the stop failed: {self.fault}"
         return True, ""
 
-    def halt(self, by: str, why: str = "", *, told: bool = True) -> None:
-        """It is stopped, or stopped once more."""
+    def halt(self, by: str, why: str = "", *, confirmed: bool = True) -> None:
+        """Stops it, or stops it again."""
         order = {"by": by, "why": why, "since": time.time()}
         if self.stopped is None:
-            self.stopped = {**order, "told": told, "again": None}
+            self.stopped = {**order, "confirmed": confirmed, "again": None}
         else:
-            self.stopped = {**self.stopped, "told": self.stopped["told"] or told, "again": order}
+            self.stopped = {
+                **self.stopped,
+                "confirmed": self.stopped["confirmed"] or confirmed,
+                "again": order,
+            }
 
     def be(self, away: bool) -> None:
-        """The robot goes, or comes: then it hears what it missed."""
+        """The robot goes offline or online; when it is back it confirms missed orders."""
         self.away = away
         if self.stopped is not None and not away:
-            self.stopped = {**self.stopped, "told": True}
+            self.stopped = {**self.stopped, "confirmed": True}
         self.changed()
 
     def resume(self, client: Any, why: str) -> tuple[bool, str]:
-        """For who has control, and owners."""
+        """For the controller and owners."""
         if client is not self.holder and client.level != "owner":
             return False, "only who has control, or an owner, may resume it"
         self.stopped = None
@@ -142,13 +152,13 @@ class Control:
             self.changed()
 
     def rights_changed(self) -> None:
-        """Who may not control the robot any more does not."""
+        """A controller without the right loses control."""
         if self.holder is not None and self.holder.level == "viewer":
             self.holder = self.request = None
         self.changed()
 
     def take_away(self) -> None:
-        """Control is lost, whoever had it."""
+        """Control is lost for any controller."""
         self.holder = self.request = None
         self.changed()
 
@@ -161,7 +171,7 @@ class Alerts:
         self._ids = itertools.count(1)
 
     def put(self, robot: str, text: str, **more: Any) -> str:
-        """A new alert, or with ``id`` more of one that is there; ``old`` says that the stream tells it no more."""
+        """A new alert, or with ``id`` an update; ``old`` means that the stream no longer has it."""
         id = more.pop("id", None) or str(next(self._ids))
         now = time.time()
         plain = {
@@ -178,18 +188,18 @@ class Alerts:
             "over": None,
             "acknowledged": None,
             "may_acknowledge": True,
-            "news": 1,
+            "notification_count": 1,
             "notify": True,
         }
         self.all[id] = {**plain, **self.all.get(id, {}), **more}
         return id
 
     def of(self, robots: list[str]) -> list[Json]:
-        """Those of some robots, the latest first."""
+        """Alerts of some robots, latest first."""
         return sorted((a for a in self.all.values() if a["robot"] in robots), key=lambda a: -a["last"])
 
     def page(self, robots: list[str], query: Json) -> Json:
-        """As the relay gives them: so many at most, after those that were told before."""
+        """A page as the relay returns it: with a size limit and a cursor."""
         lasts = {"true": ["open"], "false": ["over"]}.get(query.get("open", ""), ["open", "over"])
         fits = [each for each in self.of(robots) if each["state"] in lasts]
         robot = query.get("robot")
@@ -199,18 +209,18 @@ class Alerts:
         return {"alerts": fits[began:end], "next": str(end) if end < len(fits) else None}
 
     def streamed(self, robots: list[str]) -> list[Json]:
-        """Those that the stream tells: of what is long over it says nothing."""
+        """Alerts in the stream, which leaves old ones out."""
         return [alert for alert in self.of(robots) if not alert.get("old")]
 
     def acknowledge(self, id: str, user: str) -> Json:
-        """Somebody looks after it."""
+        """A user acknowledges it."""
         alert = self.all[id]
         alert |= {"acknowledged": {"by": user, "at": time.time()}, "may_acknowledge": False}
         return alert
 
 
 def meant(patterns: list[str], robots: list[str]) -> tuple[list[str], list[str]]:
-    """The robots an order to many means, and the patterns that mean none."""
+    """The robots selected by a fleet order, and the patterns without a match."""
     means = {each: [robot for robot in robots if fnmatchcase(robot, each)] for each in patterns}
     return sorted(set().union(*means.values())), [each for each, found in means.items() if not found]
 
@@ -218,10 +228,10 @@ def meant(patterns: list[str], robots: list[str]) -> tuple[list[str], list[str]]
 def fleet_answer(
     order: Json, robots: list[str], unmatched: list[str], do: Callable[[str], Json]
 ) -> Iterator[Json]:
-    """The lines of the answer to an order to many.
+    """The lines of the answer to a fleet order.
 
-    :param unmatched: what of the order means no robot
-    :param do: does it on one robot, and tells how that went
+    :param unmatched: parts of the order without a robot
+    :param do: executes it on one robot, and returns the result
     """
     yield {"do": order["do"], "robots": robots, "unmatched": unmatched}
     done = 0

@@ -1,4 +1,4 @@
-"""Recordings of the fake relay (protocol/SPEC.md 1.9): what grows by itself, and what a test puts there."""
+"""Recordings of the fake relay (SPEC 1.9): running ones that grow, and those of a test."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAMPLES = 40
 
 
 class Refused(Exception):
-    """Not so.
+    """A refused request.
 
     :param status: of the answer
     """
@@ -27,7 +27,7 @@ class Refused(Exception):
 
 
 class Recordings:
-    """Those of all robots, by their names."""
+    """Recordings of all robots, by name."""
 
     def __init__(self, topics: list[str], cameras: list[str]) -> None:
         self.topics, self.cameras = topics, cameras
@@ -38,9 +38,9 @@ class Recordings:
         self.full = ""
 
     def do(self, order: Json) -> None:
-        """One order of a test.
+        """An order of a test.
 
-        These are known: left, megabytes (room), full, refuse (new ones), denied (all), recording (puts one there).
+        Known ones: left, megabytes (room), full, refuse (new ones), denied (all), recording (adds one).
         """
         self.left = order.get("left", self.left)
         self.megabytes = order.get("megabytes", self.megabytes)
@@ -53,9 +53,9 @@ class Recordings:
     def answer(
         self, method: str, robot: str, path: str, user: str, level: str, body: Json, query: dict[str, str]
     ) -> tuple[int, Any]:
-        """One request; status and what is answered, bytes for a file.
+        """Handles a request; returns status and answer, bytes for a file.
 
-        :raises Refused: with status and words
+        :raises Refused: with status and text
         """
         here, may = self.of.setdefault(robot, []), level != "viewer" and not self.denied
         if path == "/new":
@@ -129,7 +129,7 @@ class Recordings:
             )
             entry["bytes"] = entry["messages"] * 700
             if entry["lasted"] >= entry["seconds"]:
-                self._end(entry, "it has taken its time")
+                self._end(entry, "its time is over")
         return entry
 
     def _end(self, entry: Json, reason: str) -> None:

@@ -1,7 +1,7 @@
-"""A small stand-in for the relay: enough HTTP and rosbridge for the portal's own tests, with robots made of sums.
+"""A small fake of the relay: enough HTTP and rosbridge for the portal's own tests, with computed robots.
 
-Run as a script it prints ``READY <port>``. ``POST /fake/do`` changes its behaviour, ``GET /fake/log`` tells what the
-page sent. It is no relay: rights are a table, nothing is judged but publishing and calling.
+Run as a script it prints ``READY <port>``. ``POST /fake/do`` changes its behaviour, ``GET /fake/log`` returns
+messages of the page. It is no relay: rights are a table, and only publishing and calling are checked.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ from urllib.parse import parse_qsl, unquote
 
 import av
 import cv2
+import fake_navigation
 import numpy as np
 from fake_control import ADDRESS, Alerts, Control, fleet_answer, meant
+from fake_navigation import Navigation
 from fake_recordings import Recordings, Refused
 from websockets.frames import Opcode
 from websockets.protocol import State
@@ -76,11 +78,11 @@ CAMERAS = {
     "/camera/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
     "/camera_rear/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
 }
-MOMENT = {"Switchboard_Moment": "1f.0123456789abcdef"}
+FRESHNESS = {"Switchboard_Freshness": "1f.0123456789abcdef"}
 ORDERS = ("take_control", "release_control", "grant_control", "refuse_control", "stop", "resume")
 STREAM = "/api/v1/robots/stream"
 CAMERA_SIZE = (640, 480)
-CAMERA_RATE = 12.0
+CAMERA_RATE = 6.0
 LINK = {"rtt_ms": 3.4, "p95_ms": 6.1, "jitter_ms": 0.4, "lost": 0, "quality": "good"}
 CSP = (
     "default-src 'self'; img-src 'self' data: blob:; style-src 'self'; connect-src 'self' ws: wss:; "
@@ -122,7 +124,7 @@ class World:
         with np.errstate(divide="ignore"):
             walls_x = np.where(c > 0, (HALL[0] - self.x) / c, (-HALL[0] - self.x) / c)
             walls_y = np.where(s > 0, (HALL[1] - self.y) / s, (-HALL[1] - self.y) / s)
-        # A ray along a wall meets it nowhere; JSON has no infinity.
+        # A ray along a wall never meets it; JSON has no infinity.
         best = np.minimum(np.where(c == 0, 99, walls_x), np.where(s == 0, 99, walls_y))
         for px, py, radius in PILLARS:
             along = (px - self.x) * c + (py - self.y) * s
@@ -165,7 +167,7 @@ class World:
         }
 
     def picture(self, behind: bool) -> np.ndarray:
-        """What a camera sees; the one that looks behind has other colours."""
+        """A camera's image; the rear camera has other colours."""
         angles = np.linspace(0.55, -0.55, 160) + math.pi * behind
         heights = np.clip(190 / (self.ranges(angles) * abs(np.cos(angles))), 4, 239)
         image = np.zeros((480, 640, 3), np.uint8)
@@ -189,7 +191,7 @@ def header(frame: str) -> Json:
 
 
 class Relay:
-    """State shared by all connections, and what the tests may change."""
+    """State shared by all connections, and the tests' changes of it."""
 
     def __init__(self, portal: Path) -> None:
         self.portal = portal
@@ -224,6 +226,7 @@ class Relay:
         for name, robot in ROBOTS.items():
             self.controls[name].away = robot["state"] == "offline"
         self.alerts = Alerts()
+        self.navigation: Navigation | None = None
         self.recordings = Recordings(
             [name for name in TOPICS if not name.startswith("/relay/")], list(CAMERAS)
         )
@@ -253,6 +256,10 @@ class Relay:
             "clients": clients,
             "holder": getattr(self.controls[name].holder, "user", None),
             "stopped": self.controls[name].stopped,
+            "people": len({each["user"] for each in clients}),
+            "suppressed": [],
+            "inhibited": [],
+            "quality": "good" if there else "lost",
             "battery": 0.76 if there else None,
             "rtt_ms": 4.2 if there else None,
             "last_seen": int(time.time() if there else self.last_seen),
@@ -264,22 +271,22 @@ class Relay:
                 channel.tell_control()
 
     def robot_list(self, user: str) -> Json:
-        return {"robots": [self.robot(user, name) for name in self.rights[user]]}
+        return {"robots": [self.robot(user, name) for name in self.rights[user]], "next": ""}
 
     def do(self, order: Json) -> None:
-        """One order of a test: close, level, silent (no data), mute (no status), frozen (no answers), say, offline,
-        dead (the robot answers no ping), gone (a topic that is there no more).
+        """An order of a test: close, level, silent (no data), mute (no status), frozen (no answers), say,
+        offline, dead (the robot answers no ping), gone (a topic that has ended).
 
-        Of HTTP: stuck (what is not answered until it is let go: "session", "orders"), failing (nobody can say who is
-        logged in).
-        Of the stream of pages: blind (it tells nothing), broken (there is none), unknown (why it can't tell).
-        Of control: take_away, stopped (by whom; told: whether the robot has heard of it), resumed, grace (seconds),
-        deny (why), implicit (whether a command took it), suppressed and inhibited (as told).
-        Of alerts: alert, see ``Alerts.put``.
-        Of video: close_video, reduced (a thin link), instead (in what another form differs that is shown), ahead
-        (seconds by which the robot's clock is wrong), kept (how many seconds old the one picture is that who begins to
-        watch gets; null: he gets new ones), source_fps.
-        Of recordings: see ``Recordings.do``.
+        Of HTTP: stuck (requests without an answer until they are released: "session", "orders"), failing (the
+        session cannot be looked up). Of the stream of pages: blind (it sends nothing), broken (there is
+        none), unknown (why it has no data). Of control: take_away, stopped (the user; told: whether the robot
+        has received it), resumed, grace (seconds), deny (the reason), fault (the failed part of a stop),
+        implicit (whether a command took it), suppressed and inhibited (as published). Of navigation, for
+        rover-1: navigation (it has Nav2), no_path (there is no path to any goal), waits (it does not drive on
+        while it has reached so many targets of its goal). Of alerts: alert, see ``Alerts.put``. Of video:
+        close_video, reduced (a slow link), instead (differing parameters of another format), ahead (seconds by
+        which the robot's clock is wrong), kept (age in seconds of the only frame for a new viewer; null: there
+        are new ones), source_fps. Of recordings: see ``Recordings.do``.
         """
         self.recordings.do(order)
         self.silent = order.get("silent", self.silent)
@@ -293,6 +300,12 @@ class Relay:
         self.unstuck.set()
         self.unstuck = asyncio.Event()
         self.failing = order.get("failing", self.failing)
+        if order.get("navigation") and self.navigation is None:
+            self.navigation = Navigation(self.worlds["rover-1"], header, HALL)
+            self.topics = dict(sorted({**self.topics, **fake_navigation.TOPICS}.items()))
+        if self.navigation is not None:
+            self.navigation.refuses = order.get("no_path", False)
+            self.navigation.waits = order.get("waits")
         self.topics.pop(order.get("gone", ""), None)
         self.reduced = order.get("reduced", self.reduced)
         self.instead = order.get("instead", self.instead)
@@ -311,12 +324,13 @@ class Relay:
             control = self.controls[order["robot"]]
             control.grace = order.get("grace", control.grace)
             control.denial = order.get("deny", control.denial)
+            control.fault = order.get("fault", control.fault)
             control.implicit = order.get("implicit", control.implicit)
             control.suppressed = order.get("suppressed", control.suppressed)
             control.inhibited = order.get("inhibited", control.inhibited)
             control.changed()
             if "stopped" in order:
-                control.halt(order["stopped"], told=order.get("told", True))
+                control.halt(order["stopped"], confirmed=order.get("confirmed", True))
                 control.changed()
             if order.get("resumed"):
                 control.stopped = None
@@ -366,7 +380,7 @@ class Socket:
 
 
 class Channel(Socket):
-    """Rosbridge."""
+    """A rosbridge websocket."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -380,12 +394,15 @@ class Channel(Socket):
         return self.relay.rights[self.user].get(self.robot, "viewer")
 
     def take(self, message: Json) -> None:
-        op = message["op"]
+        op, navigation = message["op"], self.relay.navigation
         self.note(message)
         if op == "subscribe":
             self.subscribed.setdefault(message["topic"], set()).add(message["id"])
             if message["topic"] == "/relay/control":
                 self.tell_control()
+            elif navigation is not None and message["topic"] in fake_navigation.LATCHED:
+                latched = navigation.latched(message["topic"])
+                self.send({"op": "publish", "topic": message["topic"], "msg": latched})
         elif op == "unsubscribe":
             ids = self.subscribed.get(message["topic"], set())
             ids.discard(message["id"])
@@ -398,11 +415,15 @@ class Channel(Socket):
             self.relay.worlds[self.robot].command(message["msg"])
         elif op == "call_service":
             self.call(message)
+        elif op == "send_action_goal" and navigation is not None:
+            navigation.begin(message, self.send)
+        elif op == "cancel_action_goal" and navigation is not None:
+            navigation.end(fake_navigation.CANCELED)
 
     def tell_control(self) -> None:
         if not self.relay.frozen:
-            told = self.relay.controls[self.robot].told(self)
-            self.send({"op": "publish", "topic": "/relay/control", "msg": told})
+            reported = self.relay.controls[self.robot].reported(self)
+            self.send({"op": "publish", "topic": "/relay/control", "msg": reported})
 
     def call(self, message: Json) -> None:
         if self.relay.frozen or (self.relay.dead and message["args"].get("robot")):
@@ -425,11 +446,15 @@ class Channel(Socket):
     def stream(self, now: float) -> None:
         world = self.relay.worlds[self.robot]
         makers: dict[str, tuple[float, Callable[[], Json]]] = {
-            "/odom": (20, world.odom),
-            "/scan": (10, world.scan),
+            "/odom": (5, world.odom),
+            "/scan": (2, world.scan),
             "/battery_state": (1, lambda: {"header": header(""), "percentage": 0.76, "voltage": 24.1}),
             "/relay/status": (1, self.status),
         }
+        if self.relay.navigation is not None:
+            makers["/tf"] = (5, self.relay.navigation.transforms)
+            if self.relay.navigation.goal is not None:
+                makers["/plan"] = (5, self.relay.navigation.plan)
         for topic in self.subscribed:
             rate, make = makers.get(topic, (0, dict))
             quiet = self.relay.mute if topic == "/relay/status" else self.relay.silent
@@ -475,7 +500,7 @@ class Channel(Socket):
                     "watching": [],
                 },
             )
-            address = ADDRESS if self.level == "owner" else None
+            address = ADDRESS if self.level == "owner" else ""
             if isinstance(each, Viewing):
                 person["watching"].append({"camera": each.camera, "since": self.since, "address": address})
                 continue
@@ -492,7 +517,7 @@ class Channel(Socket):
 
 
 class Viewing(Socket):
-    """A camera that is watched: one picture under way at a time (protocol/SPEC.md 1.8)."""
+    """A camera viewer: one frame under way at a time (SPEC 1.8)."""
 
     def __init__(self, *given: Any, query: Json) -> None:
         super().__init__(*given)
@@ -521,7 +546,9 @@ class Viewing(Socket):
             "delay_ms": 20.0,
             "instead": self.relay.instead,
         }
-        self.send({"op": "playing", **facts, **more, "encoding": "jpeg", "source_fps": self.relay.source_fps})
+        self.send(
+            {"op": "stream_status", **facts, **more, "encoding": "jpeg", "source_fps": self.relay.source_fps}
+        )
 
     def take(self, message: Json) -> None:
         self.note(message)
@@ -549,7 +576,7 @@ class Viewing(Socket):
             "codec": self.codec,
             "key": key,
         }
-        self.send({"op": "picture", **facts, "width": size[0], "height": size[1], "size": len(body)})
+        self.send({"op": "frame", **facts, "width": size[0], "height": size[1], "size": len(body)})
         self.protocol.send_binary(body)
         self.flush()
 
@@ -671,15 +698,21 @@ class Connection:
             self.problem(401, "You are not logged in.")
         elif method == "POST":
             await self.let_go("orders")
-            self.orders(user, path.removeprefix("/api/v1/").split("/"), json.loads(body))
+            self.orders(user, path.removeprefix("/api/v1/").split("/"), json.loads(body or b"{}"))
         elif path == "/api/v1/fleet/groups":
-            self.reply(200, {"groups": [{"name": "hall", "robots": ["rover-1"]}]}, **MOMENT)
+            self.reply(200, {"groups": [{"name": "hall", "robots": ["rover-1"]}]}, **FRESHNESS)
         elif name.endswith("/control"):
-            self.reply(200, {"robot": name.partition("/")[0]}, **MOMENT)
+            self.reply(200, {"robot": name.partition("/")[0]}, **FRESHNESS)
         elif path == "/api/v1/alerts":
             self.reply(200, self.relay.alerts.page(list(self.relay.rights[user]), self.query))
         elif name == "":
             self.reply(200, self.relay.robot_list(user))
+        elif name.endswith("/actions"):
+            navigates = self.relay.navigation is not None and name.startswith("rover-1/")
+            actions = fake_navigation.ACTIONS if navigates else {}
+            type = self.query.get("type", "")
+            found = [{"name": each, "types": [actions[each]], "moves": True} for each in actions]
+            self.reply(200, {"actions": [each for each in found if type in each["types"]], "next": ""})
         elif name in self.relay.rights[user]:
             self.reply(200, self.relay.robot(user, name))
         else:
@@ -687,7 +720,7 @@ class Connection:
 
     def orders(self, user: str, parts: list[str], ask: Json) -> None:
         self.relay.log.append({"user": user, "op": "POST " + "/".join(parts), **ask})
-        dated = self.headers.get("switchboard-moment") == MOMENT["Switchboard_Moment"]
+        dated = self.headers.get("switchboard-freshness") == FRESHNESS["Switchboard_Freshness"]
         if not dated and (ask.get("do") in ("resume", "call", "set") or parts[-1] == "resume"):
             self.problem(428, "Say when this was sent.")
         elif parts[0] == "alerts":
@@ -700,12 +733,16 @@ class Connection:
             )
         elif (done := self.order(user, parts[1], parts[-1], ask))["ok"]:
             self.reply(202 if done.get("pending") else 200, {})
+        elif parts[-1] == "stop":
+            self.problem(409, done["message"])
         else:
             self.problem(403, "Only who has control, or an owner, may do that.")
 
     def order(self, user: str, robot: str, what: str, ask: Json) -> Json:
-        """Done on one robot for all connections of a user."""
+        """Executed on one robot for all connections of a user."""
         offline = self.relay.robots[robot]["state"] == "offline"
+        if what == "module" and ask["action"] != "restart":
+            return {"ok": True, "pending": offline}
         if offline and what != "stop":
             return {"ok": False, "message": "the robot is offline"}
         if what not in ("stop", "resume"):
@@ -743,7 +780,13 @@ class Connection:
         if self.user is None or robot not in self.relay.rights[self.user]:
             self.problem(401 if self.user is None else 404, f"There is no robot '{robot}' for you.")
             return
-        size = {"width": CAMERA_SIZE[0], "height": CAMERA_SIZE[1], "fps": CAMERA_RATE, "streams": []}
+        size = {
+            "width": CAMERA_SIZE[0],
+            "height": CAMERA_SIZE[1],
+            "fps": CAMERA_RATE,
+            "seen": None,
+            "streams": [],
+        }
         cameras = [{"name": n, "type": t, "encoding": e, **size} for n, (t, e) in CAMERAS.items()]
         self.reply(200, {"cameras": cameras})
 
@@ -779,7 +822,7 @@ class Connection:
                 protocol.receive_data(data)
                 self.flush(protocol)
                 for frame in protocol.events_received():
-                    # Like the relay, it takes nothing from a connection that it has ended.
+                    # Like the relay, it reads nothing from a connection that it has ended.
                     if getattr(frame, "opcode", None) is Opcode.TEXT and protocol.state is State.OPEN:
                         socket.take(json.loads(frame.data))  # type: ignore[union-attr]
         finally:
@@ -825,6 +868,8 @@ async def stream(relay: Relay) -> None:
         await asyncio.sleep(0.02)
         for world in relay.worlds.values():
             world.step()
+        if relay.navigation is not None:
+            relay.navigation.step(0.02, relay.controls["rover-1"].stopped is not None)
         for socket in list(relay.sockets):
             if socket.protocol.state is State.OPEN and not relay.frozen:
                 socket.stream(time.monotonic())

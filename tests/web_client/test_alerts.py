@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 from playwright.sync_api import Page, Route, expect
-from switchboard_browser import seen
 
 from relay_server.fleet.order import Order
+from tests.worlds.browser import seen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,14 +22,16 @@ if TYPE_CHECKING:
 
 
 def alert(relay: FakeRelay, text: str, **more: Any) -> None:
-    """The relay tells of something."""
+    """The relay reports an alert."""
     relay.do(alert={"robot": "rover-1", "text": text, **more})
 
 
 class TestAlerts:
     @pytest.mark.parametrize("path", ["/fleet", "/cockpit/rover-1", "/alerts"])
-    def test_a_new_one_is_told_on_every_page(self, open_page: OpenPage, relay: FakeRelay, path: str) -> None:
-        """What stood before is only counted; what comes is told once, in words that make no elements."""
+    def test_a_new_alert_is_shown_on_every_page(
+        self, open_page: OpenPage, relay: FakeRelay, path: str
+    ) -> None:
+        """Earlier alerts are only counted; a new one is shown once, with its text escaped."""
         alert(relay, "it stood before")
         page = open_page(path, user="driver")
         expect(seen(page, "alerts-count")).to_have_text("1")
@@ -39,12 +41,10 @@ class TestAlerts:
         assert seen(page, "toast").locator("img").count() == 0
         expect(seen(page, "alerts-count")).to_have_text("2")
 
-    def test_what_is_not_wanted_is_only_listed(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The user's rules say what is shown by itself."""
+    def test_unselected_items_are_only_listed(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The user's rules decide which are shown by themselves."""
         page = open_page("/alerts", user="driver")
-        expect(seen(page, "alerts-empty")).to_contain_text(
-            "No alert stands open that you may see on your robots."
-        )
+        expect(seen(page, "alerts-empty")).to_contain_text("No open alerts that you may see on your robots.")
         alert(relay, "quiet", notify=False)
         expect(seen(page, "alert")).to_contain_text("quiet")
         expect(seen(page, "toast")).to_have_count(0)
@@ -53,7 +53,7 @@ class TestAlerts:
         """The toast leads to the list."""
         page = open_page("/fleet", user="driver")
         expect(seen(page, "robot-card")).to_have_count(2)
-        # Between two of the fake relay's events all of these come together, or in two lots.
+        # Between two of the fake relay's events all of these arrive together, or in two batches.
         for i in range(12):
             alert(relay, f"number {i}")
         toast = seen(page, "toast").filter(has_text=re.compile(r"rover-1: number 11, and 1?\d more"))
@@ -61,7 +61,7 @@ class TestAlerts:
         expect(seen(page, "alert")).to_have_count(12)
 
     def test_the_list_is_narrowed_and_acknowledged(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """By state and robot; who acknowledges is shown, and the count goes down."""
+        """By state and robot; the acknowledging user is shown, and the count decreases."""
         alert(relay, "low", about="main")
         alert(relay, "was low", state="over", over=time.time() - 60)
         relay.do(alert={"robot": "rover-2", "text": "other", "may_acknowledge": False})
@@ -80,8 +80,8 @@ class TestAlerts:
         seen(page, "alerts-all").click()
         expect(seen(page, "alert")).to_have_count(2)
 
-    def test_what_is_long_over_does_not_come_back(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The stream tells no more of it then; the list does not fall back on what it was told at first."""
+    def test_ended_goals_do_not_return(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The stream no longer has it; the list does not return to its first state."""
         alert(relay, "low", id="1")
         page = open_page("/alerts", user="driver")
         expect(seen(page, "alert")).to_be_visible()
@@ -93,7 +93,9 @@ class TestAlerts:
         expect(seen(page, "alert")).to_have_count(1)
 
     def test_a_long_list_goes_on_with_what_is_older(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A part more with each press, down to the oldest; another list begins anew, and what comes stands in front."""
+        """One more part with each press, down to the oldest; another list begins again, and new alerts appear
+        at the top.
+        """
         for i in range(450):
             alert(relay, f"number {i}", id=f"{i}", last=1000.0 + i, state="over", over=1000.0 + i, old=True)
         alert(relay, "it stands", id="open", last=1.0)
@@ -116,30 +118,32 @@ class TestAlerts:
         expect(seen(page, "alert").last).to_contain_text("number 251")
         expect(older).to_be_visible()
 
-    def test_what_is_gone_without_a_word_is_looked_up(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """An alert that leaves the stream while it is open was ended unheard, or is the user's no more."""
+    def test_silently_removed_entry_is_looked_up(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """An open alert that leaves the stream has ended unnoticed, or the user has lost the right."""
         alert(relay, "low", id="1")
         page = open_page("/alerts", user="driver")
         expect(seen(page, "alert")).to_be_visible()
         alert(relay, "low", id="1", state="over", over=time.time(), old=True)
         expect(seen(page, "alerts-empty")).to_be_visible()
 
-    def test_without_a_connection_nothing_is_said_to_be_well(
+    def test_without_a_connection_nothing_is_shown_as_well(
         self, open_page: OpenPage, relay: FakeRelay
     ) -> None:
-        """The page says that it is out of date, and asks again when the relay is back."""
+        """The page shows that it is out of date, and reloads when the relay is back."""
         page = open_page("/alerts", user="driver")
         expect(seen(page, "alerts-empty")).to_contain_text("No open alert")
         relay.do(broken=True)
         expect(page.get_by_text("No connection to the relay.")).to_be_visible()
-        expect(seen(page, "alerts-empty")).to_contain_text("Nothing is known")
+        expect(seen(page, "alerts-empty")).to_contain_text("The state is unknown")
         alert(relay, "low", old=True)
         relay.do(broken=False)
         expect(seen(page, "alert")).to_contain_text("low")
         expect(page.get_by_text("No connection to the relay.")).to_have_count(0)
 
     def test_notifications_are_asked_for_by_a_click(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The browser is not asked before; once it allows them, an alert that nobody looks at is shown by it."""
+        """The browser is not asked before; with permission, an alert on a hidden page is shown by the
+        browser.
+        """
         page = open_page("/login")
         page.add_init_script(
             """
@@ -167,10 +171,8 @@ class TestAlerts:
         expect(seen(page, "toast")).to_be_visible()
         assert page.evaluate("shown") == ["rover-1: low"]
 
-    def test_a_robot_that_tells_something_again_and_again_is_told_of_now_and_then(
-        self, open_page: OpenPage, relay: FakeRelay
-    ) -> None:
-        """The first alert at once, what comes soon after in one toast; what is worse waits for nothing."""
+    def test_a_repeated_alert_is_announced_periodically(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The first alert at once, others soon after in one toast; a more severe one at once."""
         page = open_page("/login")
         page.clock.install()
         page.request.post(
@@ -195,7 +197,7 @@ class TestAlerts:
     def test_those_that_find_no_room_in_the_stream_are_no_news_later(
         self, open_page: OpenPage, relay: FakeRelay
     ) -> None:
-        """The stream tells of a hundred; when one of them is over, the one that takes its place is nothing new."""
+        """The stream has a hundred; when one ends, the one that takes its place is not new."""
         for i in range(101):
             alert(relay, f"number {i}", id=f"{i}", first=1000.0 + i, last=1000.0 + i, old=i == 0)
         page = open_page("/fleet", user="driver")
@@ -205,20 +207,20 @@ class TestAlerts:
         alert(relay, "a new one", id="new")
         expect(seen(page, "toast")).to_contain_text("a new one")
         expect(seen(page, "toast")).not_to_contain_text("more")
-        alert(relay, "number 1", id="1", old=False, state="over", over=time.time(), news=2)
+        alert(relay, "number 1", id="1", old=False, state="over", over=time.time(), notification_count=2)
         expect(seen(page, "toast").last).to_contain_text("rover-1: over: number 1")
 
 
 class TestOrders:
     def hold(self, page: Page) -> None:
-        """Keep the button pressed by which many robots may move again."""
+        """Holds the button that resumes many robots."""
         seen(page, "order-resume").focus()
         page.keyboard.down("Space")
         expect(seen(page, "order-progress")).to_be_visible()
         page.keyboard.up("Space")
 
     def test_a_result_for_each_robot(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The pattern is the relay's to read; what failed says why, and the bar is full."""
+        """The relay expands the pattern; failures have a reason, and the bar is full."""
         page = open_page("/fleet", user="admin")
         seen(page, "fleet-order").click()
         seen(page, "order-pattern").fill("rover-*, arm-3")
@@ -228,7 +230,7 @@ class TestOrders:
         seen(page, "order-name").fill("/start")
         seen(page, "order-body").fill("{")
         seen(page, "order-send").click()
-        expect(seen(page, "order-failure")).to_have_text("That is no JSON.")
+        expect(seen(page, "order-failure")).to_have_text("This is not JSON.")
         seen(page, "order-body").fill('{"fast": true}')
         seen(page, "order-send").click()
         expect(seen(page, "order-progress")).to_have_text("3 of 3 robots, 1 failed, done")
@@ -241,7 +243,7 @@ class TestOrders:
         expect(seen(page, "order-result")).to_have_count(3)
 
     def test_chosen_robots_and_what_fails(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Robots are chosen among those shown; to resume one that is away fails in words."""
+        """Robots are selected in the list; resuming an offline one fails with a reason."""
         page = open_page("/fleet", user="admin")
         seen(page, "fleet-order").click()
         page.get_by_role("button", name="All 3 shown").click()
@@ -253,7 +255,7 @@ class TestOrders:
         expect(failed).to_contain_text("the robot is offline")
 
     def test_many_are_resumed_by_a_press_that_lasts(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Neither a click nor Enter in a field resumes any; the button kept pressed does."""
+        """Neither a click nor Enter in a field resumes any; holding the button does."""
         page = open_page("/fleet", user="admin")
         seen(page, "fleet-order").click()
         seen(page, "order-pattern").fill("rover-*")
@@ -262,24 +264,23 @@ class TestOrders:
         seen(page, "order-pattern").press("Enter")
         seen(page, "order-why").press("Enter")
         seen(page, "order-resume").click()
-        page.wait_for_timeout(300)  # proves absence
+        page.wait_for_timeout(300)  # shows absence
         assert relay.log(op="POST fleet") == []
         self.hold(page)
         expect(seen(page, "order-progress")).to_have_text("2 of 2 robots, done")
         assert [asked["do"] for asked in relay.log(op="POST fleet")] == ["resume"]
 
-    def test_a_name_that_means_no_robot_is_told(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Who mistypes the robot he means to stop learns that it goes on."""
+    def test_a_name_that_matches_no_robot_is_reported(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A user who mistypes the robot to stop learns that it continues."""
         page = open_page("/fleet", user="admin")
         seen(page, "fleet-order").click()
         seen(page, "order-pattern").fill("rover-1 rovr-2")
         seen(page, "order-send").click()
         expect(seen(page, "order-progress")).to_have_text("1 of 1 robots, done")
-        expect(seen(page, "order-unmatched")).to_have_text("No robot of yours is meant by rovr-2.")
+        expect(seen(page, "order-unmatched")).to_have_text("None of your robots matches rovr-2.")
 
-    @pytest.mark.parametrize("do", ["call", "publish", "set", "stop"])
-    def test_only_what_is_shown_is_sent(self, open_page: OpenPage, relay: FakeRelay, do: str) -> None:
-        """What was typed for another kind of order goes with none that does not have it: the relay would refuse it."""
+    def test_only_what_is_shown_is_sent(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Values of another kind of order are left out: the relay would refuse them."""
         page = open_page("/fleet", user="admin")
         seen(page, "fleet-order").click()
         seen(page, "order-pattern").fill("rover-1")
@@ -287,31 +288,52 @@ class TestOrders:
         seen(page, "order-do").select_option("call")
         for field, typed in {"name": "/it", "type": "std_msgs/Empty", "body": "{}"}.items():
             seen(page, f"order-{field}").fill(typed)
-        seen(page, "order-do").select_option(do)
-        fields = {"name", "type", "body", "why"}
-        shown = {each for each in fields if seen(page, f"order-{each}").count()}
-        seen(page, "order-send").click()
-        expect(seen(page, "order-progress")).to_have_text("1 of 1 robots, done")
-        [asked] = relay.log(op="POST fleet")
-        del asked["user"], asked["op"]
-        order = msgspec.json.decode(json.dumps(asked), type=Order)
-        order.check()
+        fields = {"name", "type", "body", "why", "action"}
         as_sent = {"service": "name", "topic": "name", "args": "body", "msg": "body", "value": "body"}
-        assert {as_sent.get(key, key) for key in asked.keys() - {"robots", "do"}} == shown
+        as_sent["module"] = "name"
+        for do in ("call", "publish", "set", "stop", "module"):
+            relay.do(clear_log=True)
+            seen(page, "order-do").select_option(do)
+            shown = {each for each in fields if seen(page, f"order-{each}").count()}
+            seen(page, "order-send").click()
+            [asked] = relay.until(lambda: relay.log(op="POST fleet"), f"no order to {do} was sent")
+            expect(seen(page, "order-progress")).to_have_text("1 of 1 robots, done")
+            del asked["user"], asked["op"]
+            order = msgspec.json.decode(json.dumps(asked), type=Order)
+            order.check()
+            assert order.do == do
+            assert {as_sent.get(key, key) for key in asked.keys() - {"robots", "do", "stop_id"}} == shown
+
+    def test_a_module_of_many_robots_is_stopped(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        page = open_page("/fleet", user="admin")
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill("*")
+        seen(page, "order-do").select_option("module")
+        seen(page, "order-send").click()
+        expect(seen(page, "order-failure")).to_have_text("Which module?")
+        seen(page, "order-name").fill("cleaning")
+        seen(page, "order-action").select_option("stop")
+        seen(page, "order-send").click()
+        expect(seen(page, "order-progress")).to_have_text("3 of 3 robots, done")
+        [asked] = relay.log(op="POST fleet")
+        assert (asked["do"], asked["module"], asked["action"]) == ("module", "cleaning", "stop")
+        for robot, words in (("rover-1", "done"), ("arm-3", "when it is back")):
+            result = page.locator(f"[data-testid=order-result][data-robot={robot}]")
+            expect(result).to_contain_text(words)
 
     def test_a_stop_without_an_answer_is_not_known_to_be_one(self, open_page: OpenPage) -> None:
-        """An answer that ends before it began says nothing of any robot; the page says what to do."""
+        """An aborted answer contains no robot; the page says what to do."""
         page = open_page("/fleet", user="admin")
         page.route("**/api/v1/fleet", lambda route: route.fulfill(status=200, body=""))
         page.get_by_role("button", name="Stop all robots").click()
         toast = seen(page, "toast")
         expect(toast).to_contain_text(
-            "No robot is known to be stopped: the answer broke off. Press STOP again"
+            "It is unknown which robots are stopped: the answer is incomplete. Press STOP again"
         )
         expect(toast).to_have_attribute("role", "alert")
 
-    def test_a_stop_can_not_be_ended_half_way(self, open_page: OpenPage) -> None:
-        """While it goes on there is no button that ends it, and to leave the page does not."""
+    def test_a_stop_can_not_be_cancelled(self, open_page: OpenPage) -> None:
+        """During the stop there is no cancel button, and leaving the page does not cancel it."""
         page = open_page("/fleet", user="admin")
         ended: list[str] = []
         page.on("requestfailed", lambda request: ended.append(request.url))
@@ -320,8 +342,8 @@ class TestOrders:
         seen(page, "fleet-order").click()
         seen(page, "order-pattern").fill("rover-1")
         seen(page, "order-send").click()
-        expect(page.get_by_text("Stopping. It goes on when you leave.")).to_be_visible()
-        expect(page.get_by_role("button", name="End it")).to_have_count(0)
+        expect(page.get_by_text("Stopping. It continues when you leave the page.")).to_be_visible()
+        expect(page.get_by_role("button", name="Cancel")).to_have_count(0)
         seen(page, "alerts-link").click()
         expect(seen(page, "alerts-empty")).to_be_visible()
         with page.expect_response("**/api/v1/fleet"):
@@ -329,7 +351,7 @@ class TestOrders:
         assert ended == []
 
     def test_a_long_order_fits_a_phone(self, open_page: OpenPage) -> None:
-        """However many robots are named, the button that names them is no wider than the window."""
+        """For any number of robots the button is not wider than the window."""
         page = open_page("/fleet", user="admin", width=390)
         seen(page, "fleet-order").click()
         seen(page, "order-pattern").fill(

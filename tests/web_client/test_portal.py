@@ -1,4 +1,4 @@
-"""The built portal in a real browser, against a fake relay."""
+"""The built portal in a real browser, with a fake relay."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from playwright.sync_api import Page, expect
-from switchboard_browser import hold_joystick, ready_to_drive, seen
+
+from tests.worlds.browser import hold_joystick, open_topic, ready_to_drive, seen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,8 +41,8 @@ def assert_one_zero_then_silence(page: Page, relay: FakeRelay) -> None:
 
 
 class TestLogin:
-    def test_wrong_password_is_said(self, open_page: OpenPage) -> None:
-        """A refused login shows the relay's own words and stays on the page."""
+    def test_wrong_password_is_shown(self, open_page: OpenPage) -> None:
+        """A refused login shows the relay's reason and stays on the page."""
         page = open_page("/")
         seen(page, "login-user").fill("driver")
         seen(page, "login-password").fill("guess")
@@ -50,7 +51,7 @@ class TestLogin:
         expect(seen(page, "login-password")).to_have_value("")
 
     def test_right_password_leads_to_the_robots(self, open_page: OpenPage) -> None:
-        """A login shows the fleet, and a reload keeps one logged in."""
+        """A login shows the fleet, and a reload keeps the session."""
         page = open_page("/")
         seen(page, "login-user").fill("driver")
         seen(page, "login-password").fill(PASSWORD)
@@ -60,7 +61,7 @@ class TestLogin:
         expect(seen(page, "robot-card")).to_have_count(2)
 
     def test_too_many_attempts_wait(self, open_page: OpenPage) -> None:
-        """After 429 the button counts down the time the relay named."""
+        """After 429 the button counts down the relay's time."""
         page = open_page("/login")
         seen(page, "login-user").fill("hasty")
         seen(page, "login-password").fill("x")
@@ -69,7 +70,9 @@ class TestLogin:
         expect(seen(page, "login-submit")).to_be_disabled()
 
     def test_login_link_works_once_and_leaves_no_code(self, open_page: OpenPage) -> None:
-        """A one-time link logs in, its code vanishes from the address, and the second use is refused in words."""
+        """A one-time link logs in, its code is removed from the address, and the second use is refused with a
+        reason.
+        """
         page = open_page("/login#code=ONCE-ONLY")
         expect(seen(page, "robot-card")).to_have_count(3)
         assert "ONCE-ONLY" not in page.url
@@ -78,7 +81,7 @@ class TestLogin:
         assert "ONCE-ONLY" not in other.url
 
     def test_the_page_asked_for_comes_after_the_login(self, open_page: OpenPage) -> None:
-        """Who opens a cockpit without a session logs in and lands in that cockpit."""
+        """A user who opens a cockpit without a session logs in and gets that cockpit."""
         page = open_page(COCKPIT)
         seen(page, "login-user").fill("driver")
         seen(page, "login-password").fill(PASSWORD)
@@ -86,7 +89,7 @@ class TestLogin:
         expect(seen(page, "camera-canvas")).to_be_visible()
 
     def test_logout(self, open_page: OpenPage) -> None:
-        """Logging out ends the session and shows the login page."""
+        """It ends the session and shows the login page."""
         page = open_page("/fleet", user="driver")
         seen(page, "user-menu").click()
         seen(page, "logout").click()
@@ -112,17 +115,17 @@ class TestFleet:
         relay.do(robot="rover-1", state="offline")
         expect(state).to_have_attribute("data-state", "offline")
 
-    def test_a_robot_that_has_not_heard_of_its_stop(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """It is said to be stopped only when it has said so."""
+    def test_a_robot_that_has_not_received_its_stop(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """It is shown as stopped only after its confirmation."""
         page = open_page("/", user="admin")
         state = page.locator("[data-robot=arm-3]").get_by_test_id("robot-stopped")
-        relay.do(robot="arm-3", stopped="ann", told=False)
+        relay.do(robot="arm-3", stopped="ann", confirmed=False)
         expect(state).to_have_text("Being stopped")
         relay.do(robot="arm-3", state="online")
         expect(state).to_have_text("Stopped")
 
     def test_search_and_filter(self, open_page: OpenPage) -> None:
-        """Words narrow the list; a search without result says so and offers the way back."""
+        """Words filter the list; a search without a result offers to clear it."""
         page = open_page("/", user="admin")
         seen(page, "robot-search").fill("kilted")
         expect(seen(page, "robot-card")).to_have_count(1)
@@ -131,7 +134,7 @@ class TestFleet:
         page.get_by_role("button", name="Offline").click()
         expect(seen(page, "robot-card")).to_have_attribute("data-robot", "arm-3")
 
-    def test_empty_fleet_tells_what_to_do(self, open_page: OpenPage) -> None:
+    def test_empty_fleet_explains_what_to_do(self, open_page: OpenPage) -> None:
         """Without a robot the page names the command that adds one."""
         page = open_page("/", user="newcomer")
         expect(seen(page, "fleet-empty")).to_contain_text("switchboard robot add NAME")
@@ -147,24 +150,24 @@ class TestFleet:
 class TestStopAll:
     def pressed(self, page: Page, relay: FakeRelay) -> None:
         page.get_by_role("button", name="Stop all robots").click()
-        expect(seen(page, "toast")).to_contain_text("1 robot is away, and will be stopped when back.")
+        expect(seen(page, "toast")).to_contain_text("1 robot is offline, and will be stopped when back.")
         [asked] = relay.log(op="POST fleet")
         assert (asked["do"], asked["robots"]) == ("stop", ["*"])
 
     @pytest.mark.parametrize("path", ["/fleet", "/alerts"])
     def test_before_the_robots_are_known(self, open_page: OpenPage, relay: FakeRelay, path: str) -> None:
-        """Which robots there are is for the relay to know."""
+        """The relay knows which robots to stop."""
         relay.do(blind=True)
         self.pressed(open_page(path, user="admin"), relay)
 
     def test_where_there_is_no_page(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A wrong address takes nobody's STOP away."""
+        """A wrong address still has STOP."""
         page = open_page("/nowhere", user="admin")
-        expect(page.get_by_text("There is no such page")).to_be_visible()
+        expect(page.get_by_text("Page not found")).to_be_visible()
         self.pressed(page, relay)
 
     def test_where_a_page_does_not_load(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Neither does one that hangs, nor one that fails."""
+        """So has a page that hangs or fails to load."""
         page = open_page("/fleet", user="admin")
         expect(seen(page, "robot-card")).to_have_count(3)
         waiting: list[Route] = []
@@ -177,8 +180,10 @@ class TestStopAll:
         expect(page.get_by_text("The page could not be loaded")).to_be_visible()
         expect(page.get_by_role("button", name="Stop all robots")).to_be_visible()
 
-    def test_while_nobody_can_say_who_is_logged_in(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A relay whose database hangs may still stop robots; the page that was asked for is shown when it can."""
+    def test_while_the_login_is_unknown(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A relay whose database hangs may still stop robots; the requested page is shown as soon as
+        possible.
+        """
         relay.do(failing=True)
         page = open_page("/alerts", user="admin")
         expect(page.get_by_text("The database does not answer. STOP is sent all the same.")).to_be_visible()
@@ -187,17 +192,17 @@ class TestStopAll:
         page.get_by_role("button", name="Try again").click()
         expect(page.get_by_role("heading", name="Alerts")).to_be_visible()
 
-    def test_while_the_relay_says_nothing(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A page that can't begin is not blank for long."""
+    def test_while_the_relay_is_silent(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A page that cannot load does not stay blank for long."""
         relay.do(stuck=["session"])
         page = open_page("/fleet", user="admin")
-        expect(page.get_by_text("The relay takes long to answer.")).to_be_visible()
+        expect(page.get_by_text("The relay answers slowly.")).to_be_visible()
         self.pressed(page, relay)
         relay.do(stuck=[])
         expect(seen(page, "robot-card")).to_have_count(3)
 
-    def test_of_who_turns_out_to_be_nobody(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """He reads that nothing was stopped, where he can log in."""
+    def test_a_login_that_turns_out_to_be_invalid(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The login page says that no robot was stopped."""
         relay.do(failing=True)
         page = open_page("/fleet")
         page.get_by_role("button", name="Stop all robots").click()
@@ -208,8 +213,10 @@ class TestStopAll:
         seen(page, "login-submit").click()
         expect(seen(page, "robot-card")).to_have_count(2)
 
-    def test_that_nobody_answers(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The button says at once that it is under way, and the page that it is not confirmed, until all stand."""
+    def test_a_missing_answer_is_shown(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The button shows at once that it is under way, and the page that it is not confirmed, until all
+        stand.
+        """
         page = open_page("/fleet", user="admin")
         button = page.get_by_role("button", name="Stop all robots")
         expect(seen(page, "robot-card")).to_have_count(3)
@@ -218,7 +225,7 @@ class TestStopAll:
         button.click()
         expect(button).to_have_text("Stopping…")
         page.clock.fast_forward(23_000)
-        expect(seen(page, "toast")).to_contain_text("Not all robots are known to be stopped.")
+        expect(seen(page, "toast")).to_contain_text("It is unknown whether all robots are stopped.")
         expect(button).to_have_text("STOP all")
         page.clock.fast_forward(60_000)
         for robot in ("rover-1", "rover-2"):
@@ -227,7 +234,7 @@ class TestStopAll:
                 "Stopped"
             )
             expect(seen(page, "toast")).to_be_visible()
-        relay.do(robot="arm-3", stopped="ann", told=False)
+        relay.do(robot="arm-3", stopped="ann", confirmed=False)
         state = page.locator("[data-robot=arm-3]").get_by_test_id("robot-stopped")
         expect(state).to_have_text("Being stopped")
         expect(seen(page, "toast")).to_be_visible()
@@ -235,8 +242,8 @@ class TestStopAll:
         expect(state).to_have_text("Stopped")
         expect(seen(page, "toast")).to_have_count(0)
 
-    def test_of_one_robot_that_nobody_answers(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The same by the button of its card; what is not confirmed can be dismissed."""
+    def test_a_missing_answer_of_one_robot_is_shown(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The same with the button of its card; an unconfirmed stop can be dismissed."""
         page = open_page("/fleet", user="admin")
         button = page.locator("[data-robot=rover-1]").get_by_test_id("stop")
         relay.do(stuck=["orders"])
@@ -249,8 +256,8 @@ class TestStopAll:
         seen(page, "toast").get_by_label("Dismiss").click()
         expect(seen(page, "toast")).to_have_count(0)
 
-    def test_not_where_nobody_is_logged_in(self, open_page: OpenPage) -> None:
-        """There is nobody whose robots could be meant, nor where somebody has none."""
+    def test_not_shown_without_a_login(self, open_page: OpenPage) -> None:
+        """Without a user, or with a user without robots, there is no robot to stop."""
         page = open_page("/nowhere")
         expect(seen(page, "login-user")).to_be_visible()
         expect(seen(page, "stop")).to_have_count(0)
@@ -261,7 +268,7 @@ class TestStopAll:
 
 class TestCockpit:
     def test_everything_arrives(self, open_page: OpenPage) -> None:
-        """Picture, scan, odometry, latency and topics show live data."""
+        """Video, scan, odometry, latency and topics show live data."""
         page = open_page(COCKPIT, user="driver")
         expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
         expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
@@ -282,10 +289,10 @@ class TestCockpit:
             assert colours > 10, f"{canvas} shows {colours} colours"
 
     def test_echo_shows_shortened_messages(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A chosen topic is shown live with its rate, long arrays cut, and stays as it is while paused."""
+        """A selected topic is shown live with its rate and cut arrays, and does not change while paused."""
         page = open_page(COCKPIT, user="driver")
         seen(page, "topic-filter").fill("laser")
-        page.locator("[data-testid=topic-row][data-topic='/scan']").click()
+        open_topic(page, "/scan")
         expect(seen(page, "topic-echo")).to_contain_text("… 354 more")
         expect(seen(page, "topic-rate")).to_have_text(re.compile(r"\d+(\.\d)? Hz"))
         seen(page, "topic-pause").click()
@@ -294,15 +301,14 @@ class TestCockpit:
         assert seen(page, "topic-echo").inner_text() == before
 
     def test_only_what_is_on_screen_is_subscribed(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The page asks for three topics and one camera, and for one more topic while its echo is open."""
+        """The page subscribes to three topics and one camera, and to one more topic while its echo is open."""
         page = open_page(COCKPIT, user="driver")
         expect(seen(page, "odom-x")).to_have_text("−1.00")
         shown = {"/relay/status", "/relay/control", "/scan", "/odom"}
         assert {entry["topic"] for entry in relay.log(op="subscribe")} == shown
         relay.until(lambda: relay.log(op="watch"), "no camera was watched")
         assert [entry["topic"] for entry in relay.log(op="watch")] == ["/camera/image_raw/compressed"]
-        row = page.locator("[data-testid=topic-row][data-topic='/battery_state']")
-        row.click()
+        row = open_topic(page, "/battery_state")
         expect(seen(page, "topic-echo")).to_contain_text("percentage")
         row.click()
         relay.until(
@@ -310,17 +316,17 @@ class TestCockpit:
         )
 
     def test_data_that_stops_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """When a robot falls silent its picture and values are marked as old."""
+        """When a robot falls silent its video and values are marked as old."""
         page = open_page(COCKPIT, user="driver")
         expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
         relay.do(silent=True)
-        expect(seen(page, "camera-stale")).to_have_text(re.compile(r"No picture since \d+ s"))
+        expect(seen(page, "camera-stale")).to_have_text(re.compile(r"No frame for \d+ s"))
         expect(page.get_by_text(re.compile(r"stale, \d+ s old"))).to_have_count(2)
         relay.do(silent=False)
         expect(seen(page, "camera-stale")).to_have_count(0)
 
-    def test_a_relay_that_tells_nothing_more_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Three seconds after the last status, what it told of robot and people counts as old."""
+    def test_a_silent_relay_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Three seconds after the last status, its data about robot and users counts as old."""
         page = open_page(COCKPIT, user="driver")
         expect(seen(page, "person")).to_have_count(1)
         expect(seen(page, "status-stale")).to_have_count(0)
@@ -330,8 +336,8 @@ class TestCockpit:
         relay.do(mute=False)
         expect(seen(page, "status-stale")).to_have_count(0)
 
-    def test_the_three_legs_are_told_on_request(self, open_page: OpenPage) -> None:
-        """The badge opens a table with each leg now, in 95 of 100 cases, and how many were lost."""
+    def test_the_three_parts_of_the_delay_are_shown_on_request(self, open_page: OpenPage) -> None:
+        """The badge opens a table with each part now, at the 95th percentile, and its losses."""
         page = open_page(COCKPIT, user="driver", width=390, height=844)
         expect(seen(page, "latency-badge")).to_contain_text(re.compile(r"\d+ ms"))
         seen(page, "latency-badge").click()
@@ -339,8 +345,8 @@ class TestCockpit:
         for leg in ("You to relay", "Relay to robot", "You to robot"):
             expect(table.get_by_role("row", name=leg)).to_contain_text(re.compile(r"\d+ ms.*6 ms.*0"))
 
-    def test_refusals_are_told(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A status message of the relay appears in its own words."""
+    def test_refusals_are_shown(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A status message of the relay appears unchanged."""
         page = open_page(COCKPIT, user="driver")
         expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
         relay.until(lambda: relay.log(op="set_level", level="warning"), "the page did not ask for warnings")
@@ -348,7 +354,7 @@ class TestCockpit:
         expect(seen(page, "toast")).to_contain_text("no right covers it")
 
     def test_robot_goes_offline(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """An offline robot is said to be so, and can't be driven until it is back."""
+        """An offline robot is marked, and cannot be driven until it is back."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         relay.do(robot="rover-1", state="offline")
@@ -359,7 +365,7 @@ class TestCockpit:
 
 class TestDriving:
     def test_joystick(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Holding the joystick drives at the chosen speed; letting go sends one zero, then nothing."""
+        """Holding the joystick drives at the chosen speed; releasing sends one zero, then no command."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         hold_joystick(page, dy=-120)
@@ -369,10 +375,8 @@ class TestDriving:
         assert_one_zero_then_silence(page, relay)
         expect(seen(page, "odom-speed")).to_have_text("0.00")
 
-    def test_joystick_turns_left_for_left(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Pulled to the left the robot turns left, which ROS counts as positive."""
-        page = open_page(COCKPIT, user="driver")
-        ready_to_drive(page)
+        # Pulled to the left the robot turns left, which is positive in ROS.
+        relay.do(clear_log=True)
         hold_joystick(page, dx=-60, dy=0)
         driving(relay)
         page.mouse.up()
@@ -381,10 +385,10 @@ class TestDriving:
         assert turn > 0.3
 
     def test_commands_keep_to_the_rate(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """However the stick is shaken, commands leave no faster than twenty times a second."""
+        """For any motion of the stick, at most twenty commands a second are sent."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
-        # By the page's clock and around everything: a slow machine only makes the time longer.
+        # By the page's clock, with all of the interaction: a slow machine only makes the time longer.
         began = page.evaluate("performance.now()")
         hold_joystick(page)
         box = seen(page, "joystick").bounding_box()
@@ -397,26 +401,23 @@ class TestDriving:
         assert len(relay.commands()) <= seconds * 20 + 2
 
     def test_keys(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """W drives ahead, and lifting it stops with one zero."""
+        """W drives ahead, and releasing it stops with one zero; keys in a filter are text."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
+        seen(page, "topic-filter").press_sequentially("wasd ")
+        expect(seen(page, "topic-filter")).to_have_value("wasd ")
+        page.wait_for_timeout(300)  # shows absence
+        assert relay.commands() == []
+        seen(page, "topic-filter").clear()
+        seen(page, "topic-filter").blur()
         page.keyboard.down("w")
         driving(relay)
         page.keyboard.up("w")
         assert_one_zero_then_silence(page, relay)
         assert relay.commands()[:2] == [ZERO, (0.5, 0)]
 
-    def test_keys_in_a_text_field_do_not_drive(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Typing into the filter is typing."""
-        page = open_page(COCKPIT, user="driver")
-        ready_to_drive(page)
-        seen(page, "topic-filter").press_sequentially("wasd ")
-        expect(seen(page, "topic-filter")).to_have_value("wasd ")
-        page.wait_for_timeout(300)
-        assert relay.commands() == []
-
-    def test_space_stops_whatever_has_the_focus(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """While driving, space stops, even when a button has the focus; the held key drives no further."""
+    def test_space_stops_for_any_focus(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """While driving, space stops, even if a button has the focus; the held key drives no further."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         page.locator("[data-topic='/odom']").focus()
@@ -427,32 +428,8 @@ class TestDriving:
         page.keyboard.up("ArrowUp")
         expect(seen(page, "topic-echo")).to_have_count(0)
 
-    @pytest.mark.parametrize(
-        ("event", "script"),
-        [
-            ("blur", "window.dispatchEvent(new Event('blur'))"),
-            ("pagehide", "window.dispatchEvent(new Event('pagehide'))"),
-            ("pointercancel", "window.dispatchEvent(new PointerEvent('pointercancel', { bubbles: true }))"),
-            (
-                "visibilitychange",
-                "Object.defineProperty(document, 'hidden', { value: true, configurable: true });"
-                "document.dispatchEvent(new Event('visibilitychange'))",
-            ),
-        ],
-    )
-    def test_leaving_stops(self, open_page: OpenPage, relay: FakeRelay, event: str, script: str) -> None:
-        """When the browser takes the control away, one zero goes out, and the hand still there drives no further."""
-        page = open_page(COCKPIT, user="driver")
-        ready_to_drive(page)
-        hold_joystick(page)
-        driving(relay)
-        page.evaluate(script)
-        page.mouse.move(640, 300, steps=5)
-        assert_one_zero_then_silence(page, relay)
-        page.mouse.up()
-
     def test_late_link_stops(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """When pongs stay out, driving ends, the page says so, and nothing is sent until it is taken hold of anew."""
+        """When pongs are missing, driving ends, the page shows it, and no command is sent until a new press."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         hold_joystick(page)
@@ -467,7 +444,9 @@ class TestDriving:
         page.mouse.up()
 
     def test_a_robot_that_does_not_answer_is_not_driven(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """While the relay answers and the robot does not, driving ends; when it heals, only a new grip moves it."""
+        """While the relay answers and the robot does not, driving ends; after it recovers, only a new press
+        moves it.
+        """
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         expect(seen(page, "leg-client-robot")).to_contain_text("ms")
@@ -477,12 +456,12 @@ class TestDriving:
         expect(seen(page, "robot-late")).to_be_visible()
         expect(seen(page, "driving")).to_have_count(0)
         expect(seen(page, "latency-badge")).to_have_text("robot late")
-        expect(seen(page, "drive-words")).to_contain_text("The robot is late.")
+        expect(seen(page, "drive-words")).to_contain_text("The robot responds slowly.")
         assert_one_zero_then_silence(page, relay)
         relay.do(dead=False)
-        # Asked again once the relay has given up on the ping that is out.
+        # Pinged again once the relay has given up on the pending ping.
         expect(seen(page, "latency-badge")).to_have_text(re.compile(r"\d+ ms"))
-        expect(seen(page, "drive-words")).to_contain_text("Take hold again")
+        expect(seen(page, "drive-words")).to_contain_text("Start again")
         page.mouse.move(640, 300, steps=5)
         assert_one_zero_then_silence(page, relay)
         page.mouse.up()
@@ -491,8 +470,8 @@ class TestDriving:
         driving(relay, before + 1)
         page.mouse.up()
 
-    def test_nothing_old_is_sent_after_a_reconnect(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A link cut while driving comes back by itself, and no command of before comes with it."""
+    def test_old_messages_are_dropped_after_a_reconnect(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A link cut while driving reconnects by itself, without earlier commands."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         page.keyboard.down("w")
@@ -505,7 +484,7 @@ class TestDriving:
         page.keyboard.up("w")
 
     def test_another_command_topic(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The user chooses among the topics of the type, and the choice outlasts a reload."""
+        """The user selects among the topics of the type, and the selection survives a reload."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         page.get_by_label("Command topic").select_option("/cmd_vel_nav")
@@ -536,7 +515,9 @@ class TestDriving:
 
 class TestRights:
     def test_viewer_watches_but_does_not_drive(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A viewer sees the data and the reason why the controls are off; nothing is published or advertised."""
+        """A viewer sees the data and the reason for the disabled controls; nothing is published or
+        advertised.
+        """
         page = open_page(COCKPIT, user="viewer")
         expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
         expect(seen(page, "drive-blocked")).to_contain_text("viewer")
@@ -549,7 +530,7 @@ class TestRights:
         assert relay.log(op="advertise") == []
 
     def test_lowered_right_stops_driving(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Who becomes a viewer while driving is stopped and told why."""
+        """A driver who becomes a viewer is stopped and gets the reason."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         hold_joystick(page)
@@ -558,8 +539,10 @@ class TestRights:
         expect(seen(page, "drive-blocked")).to_contain_text("viewer")
         page.mouse.up()
 
-    def test_revoked_right_is_said(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """A channel cut for a revoked right shows the reason and does not dial again; the camera is left too."""
+    def test_revoked_right_is_shown(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A channel cut for a revoked right shows the reason and does not reconnect; the camera stream ends
+        too.
+        """
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         relay.do(close=4403, reason="revoked by admin", clear_log=True)
@@ -568,19 +551,21 @@ class TestRights:
         )
         expect(seen(page, "link-state")).to_have_attribute("data-state", "closed")
         page.wait_for_timeout(1500)
-        # A picture may have been under way.
-        assert [entry for entry in relay.log() if entry["op"] != "took"] == []
+        # A frame may have been under way.
+        assert [entry for entry in relay.log() if entry["op"] != "frame_ack"] == []
         assert len(relay.log()) <= 1
 
-    def test_unknown_robot_is_said(self, open_page: OpenPage) -> None:
-        """A robot one has no right to looks like one that does not exist."""
+    def test_unknown_robot_is_shown(self, open_page: OpenPage) -> None:
+        """A robot without a right looks like a missing one."""
         page = open_page("/cockpit/arm-3", user="driver")
-        expect(seen(page, "link-banner")).to_have_text("There is no robot of this name for you.")
+        expect(seen(page, "link-banner")).to_have_text(
+            "This robot does not exist, or you have no right on it."
+        )
         page.get_by_role("button", name="To the robots").click()
         expect(seen(page, "robot-card")).to_have_count(2)
 
     def test_ended_session_leads_to_the_login(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """When the session ends in the cockpit, one logs in again and is back in it."""
+        """When the session ends in the cockpit, a new login returns to it."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         relay.do(close=4401)
@@ -591,55 +576,71 @@ class TestRights:
         ready_to_drive(page)
 
 
-@pytest.mark.parametrize("width", [390, 768, 1280])
+WIDTHS = (1280, 768, 390)
+
+
 class TestWidths:
     @pytest.mark.parametrize("path", ["/login", "/fleet", "/alerts", COCKPIT, "/nowhere"])
-    def test_no_sideways_scrolling(self, open_page: OpenPage, width: int, path: str) -> None:
+    def test_no_sideways_scrolling(self, open_page: OpenPage, path: str) -> None:
         """No page is wider than its window."""
-        page = open_page(path, width=width, user=None if path == "/login" else "admin")
+        page = open_page(path, user=None if path == "/login" else "admin")
         expect(page.locator("main")).to_be_visible()
         if path == COCKPIT:
             ready_to_drive(page)
             page.locator("[data-topic='/scan']").click()
             expect(seen(page, "topic-echo")).to_contain_text("angle_min")
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 800})
+            page.wait_for_function("document.documentElement.scrollWidth <= innerWidth")
 
-    def test_the_cockpits_bar_tells_what_counts(
-        self, open_page: OpenPage, relay: FakeRelay, width: int
-    ) -> None:
-        """The links, who has control, what alerts there are and STOP stand side by side, each to be seen whole."""
+    def test_the_cockpits_bar_shows_the_important_values(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The links, the controller, the alerts and STOP are side by side and completely visible."""
         driver = open_page(COCKPIT, user="driver")
         ready_to_drive(driver)
         relay.do(alert={"robot": "rover-1", "text": "the battery is low"})
-        page = open_page(COCKPIT, width=width, user="admin")
+        page = open_page(COCKPIT, user="admin")
         expect(seen(page, "holder")).to_have_text("driver has control")
         expect(seen(page, "alerts-count")).to_have_text("1")
         expect(seen(page, "latency-badge")).to_contain_text(re.compile(r"\d+ ms"))
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 800})
+            relay.until(lambda width=width: self._side_by_side(page, width), f"the bar is cut at {width} px")
+
+    def _side_by_side(self, page: Page, width: int) -> bool:
         boxes = [
             seen(page, each).bounding_box() for each in ("latency-badge", "holder", "alerts-link", "stop")
         ]
-        assert all(box["x"] >= 0 and box["x"] + box["width"] <= width and box["y"] < 100 for box in boxes)
-        for one, other in itertools.combinations(boxes, 2):
-            beside = one["x"] + one["width"] <= other["x"] or other["x"] + other["width"] <= one["x"]
-            assert beside or abs(one["y"] - other["y"]) >= min(one["height"], other["height"])
-        assert seen(page, "holder").evaluate("it => it.scrollWidth <= it.clientWidth"), "it is cut"
 
-    def test_stop_is_always_on_top(self, open_page: OpenPage, width: int) -> None:
-        """STOP stays visible and the top bar uncovered however far the cockpit is scrolled."""
-        page = open_page(COCKPIT, width=width, user="driver")
+        def apart(one: Any, other: Any) -> bool:
+            beside = one["x"] + one["width"] <= other["x"] or other["x"] + other["width"] <= one["x"]
+            return beside or abs(one["y"] - other["y"]) >= min(one["height"], other["height"])
+
+        return (
+            all(box["x"] >= 0 and box["x"] + box["width"] <= width and box["y"] < 100 for box in boxes)
+            and all(apart(one, other) for one, other in itertools.combinations(boxes, 2))
+            and seen(page, "holder").evaluate("it => it.scrollWidth <= it.clientWidth")
+        )
+
+    def test_stop_is_always_on_top(self, open_page: OpenPage) -> None:
+        """STOP stays visible and the top bar uncovered at any scroll position."""
+        page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
-        joystick = seen(page, "joystick").bounding_box()
-        for y in (0, joystick["y"] + joystick["height"] / 2 - 28, 5000):
-            page.evaluate(f"window.scrollTo(0, {y})")
-            assert seen(page, "stop").evaluate(
-                """stop => {
-                    const { left, top, width, height } = stop.getBoundingClientRect()
-                    const within = top >= 0 && left >= 0 && left + width <= innerWidth
-                    return within && document.elementFromPoint(left + width / 2, top + height / 2) === stop
-                }"""
-            )
-            x = joystick["x"] + joystick["width"] / 2
-            assert page.evaluate(f"document.elementFromPoint({x}, 28).closest('header') !== null")
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 800})
+            page.wait_for_function(f"innerWidth === {width}")
+            page.evaluate("window.scrollTo(0, 0)")
+            joystick = seen(page, "joystick").bounding_box()
+            for y in (0, joystick["y"] + joystick["height"] / 2 - 28, 5000):
+                page.evaluate(f"window.scrollTo(0, {y})")
+                assert seen(page, "stop").evaluate(
+                    """stop => {
+                        const { left, top, width, height } = stop.getBoundingClientRect()
+                        const within = top >= 0 && left >= 0 && left + width <= innerWidth
+                        return within && document.elementFromPoint(left + width / 2, top + height / 2) === stop
+                    }"""
+                )
+                x = joystick["x"] + joystick["width"] / 2
+                assert page.evaluate(f"document.elementFromPoint({x}, 28).closest('header') !== null")
 
 
 def test_joystick_is_under_the_video_on_a_phone(open_page: OpenPage) -> None:

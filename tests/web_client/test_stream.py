@@ -1,4 +1,4 @@
-"""What the portal is told of all robots: a stream that falls silent, many tabs, and tabs that change hands."""
+"""The portal's stream about all robots: silence, many tabs, and a change of user."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from playwright.sync_api import Page, expect
-from switchboard_browser import seen
+
+from tests.worlds.browser import seen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,26 +21,26 @@ COCKPIT = "/cockpit/rover-1"
 
 
 def dials(relay: FakeRelay) -> int:
-    """How often pages have begun to follow."""
+    """The number of streams that pages have opened."""
     return len(relay.log(op="follow"))
 
 
 def enters(page: Page, user: str) -> None:
-    """Somebody logs in at the page."""
+    """A user logs in at the page."""
     seen(page, "login-user").fill(user)
     seen(page, "login-password").fill(PASSWORD)
     seen(page, "login-submit").click()
 
 
 def leaves(page: Page) -> None:
-    """Who is logged in at the page logs out."""
+    """The page's user logs out."""
     seen(page, "user-menu").click()
     seen(page, "logout").click()
     expect(seen(page, "login-user")).to_be_visible()
 
 
 def belongs_to(page: Page, user: str) -> None:
-    """Wait until the page shows this user."""
+    """Waits until the page shows this user."""
     expect(seen(page, "user-menu")).to_have_attribute("aria-label", f"Account of {user}")
 
 
@@ -51,8 +52,8 @@ def second_tab(page: Page, path: str) -> Page:
 
 
 class TestSilence:
-    def test_it_is_said_and_another_connection_is_tried(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Nobody reports the end of a relay that is frozen, or of a path that is lost."""
+    def test_it_is_shown_and_another_connection_is_tried(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The end of a frozen relay or of a lost path is not reported by the connection."""
         page = open_page("/fleet", user="admin")
         expect(seen(page, "robot-card")).to_have_count(3)
         relay.do(blind=True)
@@ -69,30 +70,30 @@ class TestSilence:
         state = page.locator("[data-robot=rover-1]").get_by_test_id("robot-state")
         expect(state).to_have_attribute("data-state", "offline")
 
-    def test_nothing_is_said_to_be_well(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """That no alert stood open is not that none does."""
+    def test_health_is_not_claimed(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A missing alert does not prove health."""
         page = open_page("/alerts", user="driver")
         expect(seen(page, "alerts-empty")).to_contain_text("No open alert")
         relay.do(blind=True)
         page.clock.install()
         page.clock.run_for(10_000)
-        expect(seen(page, "alerts-empty")).to_contain_text("Nothing is known")
+        expect(seen(page, "alerts-empty")).to_contain_text("The state is unknown")
 
-    def test_a_relay_that_tells_nothing_from_the_start(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """The page does not go on loading for ever."""
+    def test_a_relay_that_is_silent_from_the_start(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The page does not stay in its loading state."""
         relay.do(blind=True)
         page = open_page("/fleet", user="admin")
         expect(page.get_by_text("Loading the robots…")).to_be_visible()
         expect(seen(page, "lost")).to_be_visible()
         expect(page.get_by_text("Loading the robots…")).to_have_count(0)
 
-    def test_a_relay_that_can_not_tell_says_why(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """Then the connection is well, and is kept."""
+    def test_a_relay_without_an_answer_gives_the_reason(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Then the connection works, and is kept."""
         page = open_page("/fleet", user="admin")
         expect(seen(page, "robot-card")).to_have_count(3)
         relay.do(unknown="the database does not answer")
         expect(seen(page, "lost")).to_contain_text(
-            "can’t tell how things are now. The database does not answer."
+            "cannot report the current state. The database does not answer."
         )
         relay.do(unknown="")
         expect(seen(page, "lost")).to_have_count(0)
@@ -100,20 +101,22 @@ class TestSilence:
 
 
 def test_stop_goes_out_however_many_tabs_are_open(open_page: OpenPage, relay: FakeRelay) -> None:
-    """Tabs share the few connections a browser has to one host; no page holds one for ever."""
+    """Tabs share a browser's few connections to one host; no page holds one permanently."""
     page = open_page("/fleet", user="admin")
     tabs = [page, *(second_tab(page, "/fleet") for _ in range(6))]
     for tab in tabs:
         expect(seen(tab, "robot-card")).to_have_count(3)
     tabs[-1].get_by_role("button", name="Stop all robots").click()
-    expect(seen(tabs[-1], "toast")).to_contain_text("1 robot is away")
+    expect(seen(tabs[-1], "toast")).to_contain_text("1 robot is offline")
     assert len(relay.log(op="POST fleet")) == 1
 
 
 class TestWhosePage:
     @pytest.mark.parametrize("path", ["/fleet", COCKPIT])
     def test_a_login_in_another_tab_counts_here(self, open_page: OpenPage, path: str) -> None:
-        """What the page asks for would be asked by that user from now on, so it is his wholly, and says so."""
+        """Requests of this page would be that user's from now on, so the whole page becomes theirs, with a
+        message.
+        """
         page = open_page(path, user="driver")
         belongs_to(page, "driver")
         other = second_tab(page, "/fleet")
@@ -123,8 +126,8 @@ class TestWhosePage:
         belongs_to(page, "viewer")
         expect(page).to_have_url(re.compile(path))
 
-    def test_it_is_said(self, open_page: OpenPage) -> None:
-        """A login link opens another tab as another user, and nobody logs out before."""
+    def test_it_is_reported(self, open_page: OpenPage) -> None:
+        """A login link opens another tab as another user without a logout."""
         page = open_page("/fleet", user="driver")
         expect(seen(page, "robot-card")).to_have_count(2)
         second_tab(page, "/login#code=ONCE-ONLY")
@@ -137,10 +140,10 @@ class TestWhosePage:
         expect(seen(page, "toast")).to_have_count(0)
 
     @pytest.mark.parametrize("path", ["/fleet", COCKPIT])
-    def test_a_login_nobody_told_of_is_found_with_the_next_connection(
+    def test_an_unannounced_login_is_found_with_the_next_connection(
         self, open_page: OpenPage, relay: FakeRelay, path: str
     ) -> None:
-        """A session that is another user's is not what this page had, though it is one."""
+        """Another user's session does not count as the page's former one."""
         page = open_page(path, user="admin")
         belongs_to(page, "admin")
         if path == COCKPIT:

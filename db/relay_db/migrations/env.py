@@ -1,4 +1,4 @@
-"""Run by Alembic within the connection and transaction that :mod:`relay_db.schema` opened."""
+"""Run by Alembic within the transaction that :mod:`relay_db.schema` opened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an administrator sees of his realm, many rows at a time; and that those who change it do so in turn."""
+"""Lists and counts for administrators of a realm, and the lock under which they change it."""
 
 from __future__ import annotations
 
@@ -25,31 +25,32 @@ from relay_db.models import (
     RobotRealm,
     User,
 )
-from relay_db.names import findable_hex, normalise
-from relay_db.queries.records import TokenRecord
-from relay_db.queries.rights import of_user, with_holders
+from relay_db.names import normalise, normalise_hex
+from relay_db.queries.realms import numbers_by_name
+from relay_db.queries.records import TokenRecord, fetch_all
+from relay_db.queries.rights import held_by_user, with_holders
 from relay_db.queries.tokens import list_tokens
 from relay_protocol.realms import full_name
 
 _TOKEN_NAME = 16
-"""Digits of a token's hash that name it where its number would tell how many tokens other realms have."""
+"""Digits of a token's hash that identify it over HTTP: its number would show how many tokens other realms have."""
 
 
 class RealmSize(NamedTuple):
-    """How much is in a realm."""
+    """Counts of what belongs to a realm."""
 
     users: int
     groups: int
     robots: int
     memberships: int
     rights: int
-    programs: int
+    oauth_clients: int
     robot_groups: int
     robot_memberships: int
 
 
 class RightOnRobot(NamedTuple):
-    """Where a right stands: exactly one of ``user`` and ``group`` is a name."""
+    """Robot and holder of a right. Exactly one of ``user`` and ``group`` is a name."""
 
     id: int
     robot: str
@@ -58,12 +59,12 @@ class RightOnRobot(NamedTuple):
 
 
 def lock_for_change(s: Session) -> None:
-    """Have what others change wait until this transaction ends; on SQLite it does anyway."""
+    """Make other changes wait until this transaction ends; on SQLite they always do."""
     s.execute(select(Revision.id).with_for_update())
 
 
 def realm_size(s: Session, realm: str) -> RealmSize:
-    """How much is in a realm; nothing in one that there is not."""
+    """Counts of what belongs to a realm; zeros if it does not exist."""
     of = Realm.name == normalise(realm)
     users = select(func.count(User.id)).join(Realm, Realm.id == User.realm_id)
     groups = select(func.count(Group.id)).join(Realm, Realm.id == Group.realm_id)
@@ -74,7 +75,7 @@ def realm_size(s: Session, realm: str) -> RealmSize:
         .join(Realm, Realm.id == Group.realm_id)
     )
     rights = with_holders(select(func.count(Right.id)))
-    programs = (
+    oauth_clients = (
         select(func.count(OAuthClient.id))
         .join(User, User.id == OAuthClient.user_id)
         .join(Realm, Realm.id == User.realm_id)
@@ -85,12 +86,24 @@ def realm_size(s: Session, realm: str) -> RealmSize:
         .join(RobotGroup, RobotGroup.id == RobotMembership.group_id)
         .join(Realm, Realm.id == RobotGroup.realm_id)
     )
-    counted = (users, groups, robots, memberships, rights, programs, robot_groups, in_groups)
-    return RealmSize(*(s.scalar(each.where(of)) or 0 for each in counted))
+
+    def count(query: Any) -> int:
+        return s.scalar(query.where(of)) or 0
+
+    return RealmSize(
+        users=count(users),
+        groups=count(groups),
+        robots=count(robots),
+        memberships=count(memberships),
+        rights=count(rights),
+        oauth_clients=count(oauth_clients),
+        robot_groups=count(robot_groups),
+        robot_memberships=count(in_groups),
+    )
 
 
 def count_patterns(s: Session, *, realm: str, robot_id: int | None = None) -> int:
-    """How many patterns the rights that are held in a realm have, or those of them on a robot."""
+    """The number of patterns in the rights that are held in a realm, on one robot or on all."""
     none: Any = literal([], JsonText)
     query = with_holders(select(Right.allow, Right.deny)).where(
         Realm.name == normalise(realm), or_(Right.allow != none, Right.deny != none)
@@ -100,53 +113,48 @@ def count_patterns(s: Session, *, realm: str, robot_id: int | None = None) -> in
     return sum(len(allow) + len(deny) for allow, deny in s.execute(query))
 
 
-def right_places(
+def list_right_holders(
     s: Session, realm: str, *, robot_id: int | None = None, user_id: int | None = None
 ) -> list[RightOnRobot]:
-    """Where the rights that are held in a realm stand, without what they say; of a user also those by its groups."""
-    query = with_holders(select(Right.id, Robot.name, User.name, Group.name)).where(
-        Realm.name == normalise(realm)
-    )
+    """Robots and holders of the rights that are held in a realm. With ``user_id`` also rights through groups."""
+    query = with_holders(
+        select(Right.id, Robot.name.label("robot"), User.name.label("user"), Group.name.label("group"))
+    ).where(Realm.name == normalise(realm))
     query = query.join(Robot, Robot.id == Right.robot_id)
     if robot_id is not None:
         query = query.where(Right.robot_id == robot_id)
     if user_id is not None:
-        query = query.where(of_user(user_id))
-    return [RightOnRobot(*row) for row in s.execute(query)]
+        query = query.where(held_by_user(user_id))
+    return fetch_all(s, RightOnRobot, query)
 
 
 def groups_of(s: Session, user_ids: Collection[int]) -> dict[int, list[str]]:
-    """The names of the groups that users are in, by the number of the user; nothing of who is in none."""
+    """The names of the groups of users, by the number of the user. Users without a group are missing."""
     rows = s.execute(
         select(Membership.user_id, Group.name)
         .join(Group, Group.id == Membership.group_id)
         .where(Membership.user_id.in_(user_ids))
     )
-    return _gathered(rows)
+    return _names_by_number(rows)
 
 
 def members_of(s: Session, group_ids: Collection[int]) -> dict[int, list[str]]:
-    """The names of those who are in groups, by the number of the group; nothing of one that nobody is in."""
+    """The names of the members of groups, by the number of the group. Empty groups are missing."""
     rows = s.execute(
         select(Membership.group_id, User.name)
         .join(User, User.id == Membership.user_id)
         .where(Membership.group_id.in_(group_ids))
     )
-    return _gathered(rows)
+    return _names_by_number(rows)
 
 
 def group_names(s: Session, realm: str) -> dict[str, int]:
-    """The groups of a realm: numbers by name."""
-    rows = s.execute(
-        select(Group.name, Group.id)
-        .join(Realm, Realm.id == Group.realm_id)
-        .where(Realm.name == normalise(realm))
-    )
-    return {row.name: row.id for row in rows}
+    """The numbers of the groups of users of a realm, by name."""
+    return numbers_by_name(s, Group, realm)
 
 
 def count_live_keys(s: Session, robot_ids: Collection[int]) -> dict[int, int]:
-    """How many keys of robots are live, by the number of the robot; nothing of one without."""
+    """The number of live keys of robots, by the number of the robot. Robots without one are missing."""
     rows = s.execute(
         select(RobotKey.robot_id, func.count(RobotKey.id))
         .where(RobotKey.robot_id.in_(robot_ids), RobotKey.retired.is_(None))
@@ -155,8 +163,8 @@ def count_live_keys(s: Session, robot_ids: Collection[int]) -> dict[int, int]:
     return {row[0]: row[1] for row in rows}
 
 
-def named_tokens(s: Session, user_id: int) -> dict[str, TokenRecord]:
-    """A user's tokens by names that tell nothing of others' tokens, nor what could be used as one."""
+def tokens_by_name(s: Session, user_id: int) -> dict[str, TokenRecord]:
+    """A user's tokens by a name that shows nothing about other tokens, and is not usable as a token."""
     names = s.execute(
         select(AccessToken.id, func.substr(AccessToken.token_hash, 1, _TOKEN_NAME)).where(
             AccessToken.user_id == user_id
@@ -167,8 +175,8 @@ def named_tokens(s: Session, user_id: int) -> dict[str, TokenRecord]:
 
 
 def find_token(s: Session, name: str, realm: str) -> int | None:
-    """The number of the token of that name (:func:`named_tokens`), if its user is of the realm."""
-    if len(name) != _TOKEN_NAME or not findable_hex(name):
+    """The number of a token by its name (:func:`tokens_by_name`), if its user belongs to the realm."""
+    if len(name) != _TOKEN_NAME or not normalise_hex(name):
         return None
     named: ColumnElement[bool] = AccessToken.token_hash.startswith(name)
     query = (
@@ -181,22 +189,22 @@ def find_token(s: Session, name: str, realm: str) -> int | None:
 
 
 def user_of_token(s: Session, token_id: int) -> str | None:
-    """The full name of whom a token proves; ``None`` if there is none of that number."""
-    return _full_name(s, AccessToken, token_id)
+    """The full name of the user of a token; ``None`` if there is no such token."""
+    return _user_of(s, AccessToken, token_id)
 
 
-def user_of_program(s: Session, program_id: int) -> str | None:
-    """The full name of whom a program acts for; ``None`` if there is none of that number."""
-    return _full_name(s, OAuthClient, program_id)
+def user_of_oauth_client(s: Session, oauth_client_id: int) -> str | None:
+    """The full name of the user of an OAuth client; ``None`` if there is no such client."""
+    return _user_of(s, OAuthClient, oauth_client_id)
 
 
-def _full_name(s: Session, what: type[AccessToken] | type[OAuthClient], number: int) -> str | None:
-    query = select(User.name, Realm.name).join(Realm, Realm.id == User.realm_id)
-    row = s.execute(query.join(what, what.user_id == User.id).where(what.id == number)).one_or_none()
-    return None if row is None else full_name(*row)
+def _user_of(s: Session, table: type[AccessToken] | type[OAuthClient], number: int) -> str | None:
+    query = select(User.name, Realm.name.label("realm")).join(Realm, Realm.id == User.realm_id)
+    row = s.execute(query.join(table, table.user_id == User.id).where(table.id == number)).one_or_none()
+    return None if row is None else full_name(row.name, row.realm)
 
 
-def _gathered(rows: Any) -> dict[int, list[str]]:
+def _names_by_number(rows: Any) -> dict[int, list[str]]:
     found: dict[int, list[str]] = defaultdict(list)
     for number, name in rows:
         found[number].append(name)

@@ -1,4 +1,4 @@
-"""Alerts, and the rules by which people are told of them."""
+"""Alerts, and the rules by which users are notified of them."""
 
 from __future__ import annotations
 
@@ -11,57 +11,60 @@ from sqlalchemy import and_, case, delete, func, insert, literal, or_, select, t
 from sqlalchemy.orm import Session
 
 from relay_db.models import Alert, AlertRule, Realm, Robot, User
-from relay_db.names import label, sanitise
-from relay_db.queries.records import AlertRecord, AlertRuleRecord
-from relay_db.queries.state import bump
+from relay_db.names import checked_label, sanitise
+from relay_db.queries.records import AlertRecord, AlertRuleRecord, fetch_all, fetch_one, record_of
+from relay_db.queries.revision import bump
 from relay_db.queries.users import live_user
 from relay_protocol.errors import Invalid, NotFound
-from relay_protocol.limits import WORDS
+from relay_protocol.limits import TEXT_LENGTH
 
-RULES = 32
+MAX_RULES = 32
 """Most rules of one user."""
 
-ALERTS = 100_000
-"""Most alerts kept of one realm, whatever their age."""
+MAX_ALERTS = 100_000
+"""Most alerts of one realm, whatever their age."""
 
-NUMBERS = 2**31 - 1
-"""The greatest number of a rule."""
+MAX_RULE_NUMBER = 2**31 - 1
+"""Highest number of a rule."""
 
-_RECENT = 1000
-"""Most alerts of one robot that are over, of those of late."""
+_MAX_RECENT = 1000
+"""Most ended alerts of one robot that :func:`recent_alerts` returns."""
 
 _PAGE = 1000
-_BY_ROBOT = 8
-"""Of no more robots alerts are looked up by robot."""
+_MAX_BY_ROBOT = 8
+"""Most robots for which the index on the robot is used. For more the index on the time is used."""
 
 
 def save_alerts(s: Session, records: Iterable[AlertRecord]) -> None:
-    """Keep alerts as they are now, new ones and known ones; those of robots that are gone are let go.
+    """Write new and changed alerts. Alerts of removed robots are skipped.
 
-    Who looks after one may have been written by somebody else meanwhile, and stays unless there was news since.
+    Another process may have written an acknowledgement meanwhile: it stays unless the alert became worse since.
     """
     records = list(records)
-    asked = {each.robot_id for each in records}
-    there = set(s.scalars(select(Robot.id).where(Robot.id.in_(asked)))) if asked else set()
+    robot_ids = {each.robot_id for each in records}
+    existing = set(s.scalars(select(Robot.id).where(Robot.id.in_(robot_ids)))) if robot_ids else set()
     for each in records:
-        if each.robot_id not in there:
+        if each.robot_id not in existing:
             continue
         values = _values(each)
-        there_too = s.execute(
+        updated = s.execute(
             update(Alert)
             .where(Alert.id == each.id)
-            .values({**values, **_looked_after(each)})
+            .values({**values, **_acknowledgement(each)})
             .returning(Alert.id)
         )
-        if there_too.first() is None:
+        if updated.first() is None:
             s.execute(insert(Alert).values(id=each.id, **values))
 
 
-def _looked_after(record: AlertRecord) -> dict[str, Any]:
-    """What a row that is there says of who looks after it, once the record is written."""
+def _acknowledgement(record: AlertRecord) -> dict[str, Any]:
+    """The acknowledgement of an existing row after a record without one is written."""
     if record.ack_at is not None:
         return {}
-    same = or_(literal(record.over is not None), and_(Alert.over_at.is_(None), Alert.news == record.news))
+    same = or_(
+        literal(record.over is not None),
+        and_(Alert.over_at.is_(None), Alert.notification_count == record.notification_count),
+    )
     return {
         "ack_by": case((same, Alert.ack_by), else_=None),
         "ack_at": case((same, Alert.ack_at), else_=None),
@@ -74,11 +77,11 @@ def _values(record: AlertRecord) -> dict[str, Any]:
         "kind": sanitise(record.kind, 63),
         "about": sanitise(record.about),
         "level": record.level,
-        "text": sanitise(record.text, WORDS),
+        "text": sanitise(record.text, TEXT_LENGTH),
         "first_at": record.first,
         "last_at": record.last,
-        "times": record.times,
-        "news": record.news,
+        "report_count": record.report_count,
+        "notification_count": record.notification_count,
         "over_at": record.over,
         "ack_by": record.ack_by,
         "ack_at": record.ack_at,
@@ -92,145 +95,151 @@ def list_alerts(
     open: bool | None = None,
     limit: int = 100,
     after: tuple[float, str] | None = None,
-    kinds_but: Mapping[str, Collection[int]] = MappingProxyType({}),
-    but: Collection[tuple[int, str, str]] = (),
+    except_kinds: Mapping[str, Collection[int]] = MappingProxyType({}),
+    except_alerts: Collection[tuple[int, str, str]] = (),
 ) -> list[AlertRecord]:
     """Alerts, the latest first.
 
-    :param robots: of these robots only; ``None`` for all
-    :param open: only those that last, or only those that are over
-    :param after: only those that come after the one with this ``last`` and ``id``, whether it is there or not
-    :param kinds_but: by kind, robots of which none of it is wanted
-    :param but: robot, kind and part of those that are not wanted
+    :param robots: only of the robots with these numbers; ``None`` for all
+    :param open: only open ones, or only ended ones
+    :param after: ``last`` and ``id`` of the alert before the first
+    :param except_kinds: numbers of robots whose alerts of a kind are left out, by kind
+    :param except_alerts: number of the robot, kind and ``about`` of alerts that are left out
     """
     query = _alerts().order_by(Alert.last_at.desc(), Alert.id).limit(limit)
     if robots is not None:
-        # Of many robots by time: by robot, all they ever told would be sorted for one page.
-        of: Any = Alert.robot_id if len(robots) <= _BY_ROBOT else Alert.robot_id + 0
+        # For many robots by time: by robot, all their alerts would be sorted for one page.
+        of: Any = Alert.robot_id if len(robots) <= _MAX_BY_ROBOT else Alert.robot_id + 0
         query = query.where(of.in_(list(robots)))
     if after is not None:
         last, id = after
-        # The first condition says nothing new: by it an index is read from there on, which by an 'or' it is not.
+        # The first condition is implied by the second. Only the first lets the index start at that position.
         query = query.where(Alert.last_at <= last, or_(Alert.last_at < last, Alert.id > sanitise(id, 32)))
-    for kind, of in kinds_but.items():
+    for kind, of in except_kinds.items():
         query = query.where(or_(Alert.kind != kind, Alert.robot_id.not_in(list(of))))
-    if but:
-        query = query.where(tuple_(Alert.robot_id, Alert.kind, Alert.about).not_in(list(but)))
+    if except_alerts:
+        query = query.where(tuple_(Alert.robot_id, Alert.kind, Alert.about).not_in(list(except_alerts)))
     if open is not None:
         query = query.where(Alert.over_at.is_(None) if open else Alert.over_at.is_not(None))
-    return [AlertRecord(*row) for row in s.execute(query)]
+    return fetch_all(s, AlertRecord, query)
 
 
 def recent_alerts(s: Session, since: float) -> list[AlertRecord]:
-    """All alerts that last, and of each robot the latest that were over after this moment.
+    """All open alerts, and of each robot the latest that ended after a time.
 
     :param since: Unix seconds
     """
-    # By robot: what one tells must not keep another's alerts from being known.
+    # The limit is for each robot, so that one with many alerts displaces no others.
     place = func.row_number().over(partition_by=Alert.robot_id, order_by=(Alert.last_at.desc(), Alert.id))
     late = select(Alert.id, place.label("place")).where(Alert.over_at >= since).subquery()
-    chosen = select(late.c.id).where(late.c.place <= _RECENT)
+    chosen = select(late.c.id).where(late.c.place <= _MAX_RECENT)
     query = _alerts().where(or_(Alert.over_at.is_(None), Alert.id.in_(chosen)))
-    return [AlertRecord(*row) for row in s.execute(query.order_by(Alert.last_at.desc()))]
+    return fetch_all(s, AlertRecord, query.order_by(Alert.last_at.desc()))
 
 
 def get_alert(s: Session, alert_id: str) -> AlertRecord | None:
-    """One alert."""
-    row = s.execute(_alerts().where(Alert.id == sanitise(alert_id, 32))).one_or_none()
-    return None if row is None else AlertRecord(*row)
+    return fetch_one(s, AlertRecord, _alerts().where(Alert.id == sanitise(alert_id, 32)))
 
 
 def acknowledge_alert(s: Session, alert_id: str, by: str, at: float) -> AlertRecord:
-    """Somebody looks after an alert; a relay that runs takes it up by the revision. The first who did stays.
+    """Acknowledge an open alert. An earlier acknowledgement stays. A running relay is notified by the revision.
 
     :param at: Unix seconds
     :raises NotFound: no such alert
     :raises Invalid: it is over
     """
-    lasts = Alert.over_at.is_(None), Alert.ack_at.is_(None)
-    known = update(Alert).where(Alert.id == sanitise(alert_id, 32), *lasts)
-    values = known.values(ack_by=sanitise(by), ack_at=at)
-    fresh = s.execute(values.returning(Alert.id)).first() is not None
+    unacknowledged = Alert.over_at.is_(None), Alert.ack_at.is_(None)
+    change = (
+        update(Alert)
+        .where(Alert.id == sanitise(alert_id, 32), *unacknowledged)
+        .values(ack_by=sanitise(by), ack_at=at)
+    )
+    changed = s.execute(change.returning(Alert.id)).first() is not None
     found = get_alert(s, alert_id)
     if found is None:
         raise NotFound("there is no such alert")
     if found.over is not None:
         raise Invalid("this alert is over already")
-    if fresh:
+    if changed:
         bump(s)
     return found
 
 
 def acknowledgements(s: Session) -> dict[str, tuple[str, float]]:
-    """Who looks after which of the alerts that last, and since when."""
+    """User and time (Unix seconds) of the acknowledgements of open alerts, by the id of the alert."""
     query = select(Alert.id, Alert.ack_by, Alert.ack_at).where(
         Alert.over_at.is_(None), Alert.ack_at.is_not(None)
     )
     return {row.id: (row.ack_by or "", row.ack_at) for row in s.execute(query)}
 
 
-def purge_alerts(s: Session, before: float, most: int = ALERTS, batch: int = _PAGE) -> int:
-    """Forget a batch of what is over and too old, or too much for its realm; how many. Call again until it is 0.
+def purge_alerts(s: Session, before: float, max_alerts: int = MAX_ALERTS, batch: int = _PAGE) -> int:
+    """Delete a batch of ended alerts that are too old or too many; returns how many. Call it until it returns 0.
 
-    :param before: Unix seconds; what was told last before that goes
-    :param most: rows of a realm that may stay, whatever their age
-    :param batch: most that go at once, of each realm
+    :param before: Unix seconds; ended alerts with an earlier last report are deleted
+    :param max_alerts: most alerts of a realm, whatever their age
+    :param batch: most alerts that are deleted at once, of each realm
     """
     over = Alert.over_at.is_not(None)
     old = select(Alert.id).where(over, Alert.last_at < before).limit(batch)
-    gone = len(s.scalars(delete(Alert).where(Alert.id.in_(old)).returning(Alert.id)).all())
-    if gone:
-        return gone
+    deleted = len(s.scalars(delete(Alert).where(Alert.id.in_(old)).returning(Alert.id)).all())
+    if deleted:
+        return deleted
     count = func.count()
     full = select(Robot.realm_id, count).join(Alert, Alert.robot_id == Robot.id).group_by(Robot.realm_id)
-    for realm, rows in s.execute(full.having(count > most)).all():
-        theirs = Alert.robot_id.in_(select(Robot.id).where(Robot.realm_id == realm))
-        oldest = select(Alert.id).where(over, theirs).order_by(Alert.last_at).limit(min(batch, rows - most))
-        gone += len(s.scalars(delete(Alert).where(Alert.id.in_(oldest)).returning(Alert.id)).all())
-    return gone
+    for realm, rows in s.execute(full.having(count > max_alerts)).all():
+        in_realm = Alert.robot_id.in_(select(Robot.id).where(Robot.realm_id == realm))
+        oldest = (
+            select(Alert.id)
+            .where(over, in_realm)
+            .order_by(Alert.last_at)
+            .limit(min(batch, rows - max_alerts))
+        )
+        deleted += len(s.scalars(delete(Alert).where(Alert.id.in_(oldest)).returning(Alert.id)).all())
+    return deleted
 
 
 def add_alert_rule(
     s: Session,
     user_id: int,
     *,
-    name: str = "",
+    label: str = "",
     robots: str = "*",
     kinds: Collection[str] = (),
     level: str,
     channel: str,
     url: str = "",
     secret: str = "",
-    over: bool = True,
+    notify_end: bool = True,
     group_s: float,
     quiet: Mapping[str, str] | None = None,
     created: float,
 ) -> AlertRuleRecord:
-    """Tell a user of alerts from now on. What the words mean the relay judges before.
+    """Add a rule, which the caller has checked.
 
-    :param name: for people
+    :param label: for display
     :param created: Unix seconds
-    :raises Invalid: the user has too many rules, or the name is no line of text
+    :raises Invalid: the user has too many rules, or the label is not valid
     :raises NotFound: no such user
     """
     if s.scalar(select(User.id).where(User.id == user_id).with_for_update()) is None:
         raise NotFound("there is no such user")
-    mine = s.scalar(select(func.count()).select_from(AlertRule).where(AlertRule.user_id == user_id)) or 0
-    if mine >= RULES:
-        raise Invalid(f"a user has at most {RULES} rules for alerts; delete one first")
+    count = s.scalar(select(func.count()).select_from(AlertRule).where(AlertRule.user_id == user_id)) or 0
+    if count >= MAX_RULES:
+        raise Invalid(f"a user has at most {MAX_RULES} rules for alerts; delete one first")
     bump(s)
-    number = _fresh_number(s)
+    number = _unused_number(s)
     values = {
         "id": number,
         "user_id": user_id,
-        "label": label(name, "label of a rule"),
+        "label": checked_label(label, "label of a rule"),
         "robots": robots,
         "kinds": list(kinds),
         "level": level,
         "channel": channel,
         "url": url,
         "secret": secret,
-        "over": over,
+        "notify_end": notify_end,
         "group_s": group_s,
         "quiet": None if quiet is None else dict(quiet),
         "created": created,
@@ -239,22 +248,22 @@ def add_alert_rule(
     return next(each for each in list_alert_rules(s, user_id) if each.id == number)
 
 
-def _fresh_number(s: Session) -> int:
-    """A number that no rule has. Drawn: who sees his own must not learn how many others are made."""
+def _unused_number(s: Session) -> int:
+    """A random number that no rule has. Counted numbers would show users how many rules others add."""
     while True:
-        number = secrets.randbelow(NUMBERS) + 1
+        number = secrets.randbelow(MAX_RULE_NUMBER) + 1
         if s.scalar(select(AlertRule.id).where(AlertRule.id == number)) is None:
             return number
 
 
 def list_alert_rules(s: Session, user_id: int | None = None) -> list[AlertRuleRecord]:
-    """The rules of a user, or of all who are not disabled, oldest first."""
+    """The rules of one user, or of all users that are not disabled, oldest first."""
     query: Any = (
         select(
             AlertRule.id,
-            User.id,
-            User.name,
-            Realm.name,
+            AlertRule.user_id,
+            User.name.label("user"),
+            Realm.name.label("realm"),
             AlertRule.label,
             AlertRule.robots,
             AlertRule.kinds,
@@ -262,7 +271,7 @@ def list_alert_rules(s: Session, user_id: int | None = None) -> list[AlertRuleRe
             AlertRule.channel,
             AlertRule.url,
             AlertRule.secret,
-            AlertRule.over,
+            AlertRule.notify_end,
             AlertRule.group_s,
             AlertRule.quiet,
             AlertRule.created,
@@ -272,19 +281,18 @@ def list_alert_rules(s: Session, user_id: int | None = None) -> list[AlertRuleRe
         .order_by(AlertRule.created, AlertRule.id)
     )
     query = query.where(live_user() if user_id is None else User.id == user_id)
-    rows = (AlertRuleRecord(*row) for row in s.execute(query))
-    return [row._replace(kinds=tuple(row.kinds)) for row in rows]
+    return [record_of(AlertRuleRecord, row, kinds=tuple(row.kinds)) for row in s.execute(query)]
 
 
 def remove_alert_rule(s: Session, rule_id: int, user_id: int | None = None) -> bool:
-    """Tell nobody by this rule any more; false if there is none of that number.
+    """Remove a rule; false if there is none of this number.
 
-    :param user_id: only if it is this user's
+    :param user_id: only if the rule belongs to this user
     """
-    gone = delete(AlertRule).where(AlertRule.id == rule_id)
+    statement = delete(AlertRule).where(AlertRule.id == rule_id)
     if user_id is not None:
-        gone = gone.where(AlertRule.user_id == user_id)
-    found = s.scalar(gone.returning(AlertRule.id)) is not None
+        statement = statement.where(AlertRule.user_id == user_id)
+    found = s.scalar(statement.returning(AlertRule.id)) is not None
     if found:
         bump(s)
     return found
@@ -294,17 +302,17 @@ def _alerts() -> Any:
     query: Any = select(
         Alert.id,
         Alert.robot_id,
-        Robot.name,
-        Realm.name,
+        Robot.name.label("robot"),
+        Realm.name.label("realm"),
         Alert.kind,
         Alert.about,
         Alert.level,
         Alert.text,
-        Alert.first_at,
-        Alert.last_at,
-        Alert.times,
-        Alert.news,
-        Alert.over_at,
+        Alert.first_at.label("first"),
+        Alert.last_at.label("last"),
+        Alert.report_count,
+        Alert.notification_count,
+        Alert.over_at.label("over"),
         Alert.ack_by,
         Alert.ack_at,
     ).join(Robot, Robot.id == Alert.robot_id)

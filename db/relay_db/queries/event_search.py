@@ -1,8 +1,8 @@
-"""Finds events of the short-term memory.
+"""Finds stored events.
 
-A query looks at a bounded part of the rows, from the newest back, and says where to go on: however little of a
-memory is asked for, nobody waits long for the thread that looks. Rows are found by the index on what is most exact;
-everything else is judged on what that yields.
+A query scans a bounded number of rows, from the newest back, and returns a cursor for the rest, so that no search
+occupies a reading thread for long. The rows are found by the index of the most selective condition; the other
+conditions are tested on these rows.
 """
 
 from __future__ import annotations
@@ -30,27 +30,29 @@ from sqlalchemy import (
 from sqlalchemy.orm import Session
 
 from relay_db.base import canonical_json
-from relay_db.models import Realm, StoredEvent, StoredEventCount
+from relay_db.models import LastEventNumber, Realm, StoredEvent
 from relay_db.queries.records import (
     EventCursor,
     EventSearch,
-    MemoryPage,
+    FoundEvents,
     StoredEventCounts,
     StoredEventRecord,
+    fetch_all,
+    record_of,
 )
 
-OURS = "relay"
-"""Sources that begin so are the relay's own."""
+RELAY_SOURCE = "relay"
+"""Prefix of the relay's own sources of events."""
 
-LOGIN = "login"
-"""Kinds that begin so are for administrators, where they are about no robot."""
+LOGIN_KIND = "login"
+"""Prefix of kinds that only administrators may see, if the event is about no robot."""
 
-LOOKED_AT = 10_000
-SCATTERED = 5_000
-"""Rows one call looks at, at most: by time alone, and by an index whose rows lie apart, so that each takes longer."""
+MAX_SCANNED = 10_000
+MAX_SCANNED_SCATTERED = 5_000
+"""Most rows that one call scans: by time, and by another index, whose rows are scattered and take longer."""
 
-_SLICES = (256, 2048, LOOKED_AT)
-"""Rows of one look: small first, since most askers want what came last."""
+_SLICES = (256, 2048, MAX_SCANNED)
+"""Rows of successive scans. The first is small, because most searches are for the newest events."""
 
 _COLUMNS = (
     StoredEvent.number,
@@ -58,108 +60,118 @@ _COLUMNS = (
     StoredEvent.source,
     StoredEvent.kind,
     StoredEvent.robot_id,
-    StoredEvent.user_name,
+    StoredEvent.user_name.label("user"),
     StoredEvent.data,
-    StoredEvent.used,
+    StoredEvent.use_count,
 )
 
 
-def recall(s: Session, ask: EventSearch, place: EventCursor | None, limit: int) -> MemoryPage:
-    """Events, the newest first: as many as were found among :data:`LOOKED_AT` or :data:`SCATTERED` rows.
+def search_events(s: Session, search: EventSearch, cursor: EventCursor | None, limit: int) -> FoundEvents:
+    """The events found among :data:`MAX_SCANNED` or :data:`MAX_SCANNED_SCATTERED` rows, the newest first.
 
-    :param place: only those that come after this one
+    :param cursor: the position after which the search begins
     :param limit: most events
     """
     found: list[StoredEventRecord] = []
-    values, most, looked = _values(s, ask), _most(ask), 0
+    values, max_rows, scanned = _values(s, search), _max_rows(search), 0
     for size in _SLICES:
-        size = min(size, most - looked)
-        looked += size
-        room = limit - len(found)
-        asked = _asked(_shape(s, ask, place))
-        now = {**values, **_place_values(place), "size": size, "room": room}
-        rows = s.execute(asked.rows, now).all()
-        found += [_record(ask, row) for row in rows if _fits(ask, row.data)]
-        # Where there was no room for more of this part, the next one begins within it.
-        place = EventCursor(rows[-1].at, rows[-1].number) if len(rows) == room else _end(s, asked, now)
-        if place is None or len(found) == limit:
+        size = min(size, max_rows - scanned)
+        scanned += size
+        left = limit - len(found)
+        statements = _statements(_shape(s, search, cursor))
+        parameters = {**values, **_cursor_values(cursor), "size": size, "limit": left}
+        rows = s.execute(statements.rows, parameters).all()
+        found += [_record(search, row) for row in rows if _matches(search, row.data)]
+        # If the limit was reached, the next search begins within this slice.
+        full = len(rows) == left
+        cursor = (
+            EventCursor(rows[-1].at, rows[-1].number) if full else _next_cursor(s, statements, parameters)
+        )
+        if cursor is None or len(found) == limit:
             break
-    return MemoryPage(found, place)
+    return FoundEvents(found, cursor)
 
 
-def count_memories(s: Session, ask: EventSearch, place: EventCursor | None, few: int) -> StoredEventCounts:
-    """How many there are among as many rows as :func:`recall` looks at, and where to go on.
+def count_events(
+    s: Session, search: EventSearch, cursor: EventCursor | None, max_numbers: int
+) -> StoredEventCounts:
+    """Count events among as many rows as :func:`search_events` scans.
 
-    :param place: only those that come after this one
-    :param few: of so many, and of no more, the numbers are told
+    :param cursor: the position after which the count begins
+    :param max_numbers: the numbers of the events are returned if there are at most so many
     """
-    asked = _asked(_shape(s, ask, place))
-    now = {**_values(s, ask), **_place_values(place), "size": _most(ask), "room": few + 1}
-    if ask.data:
-        numbers = [row.number for row in s.execute(asked.data, now) if _fits(ask, row.data)]
+    statements = _statements(_shape(s, search, cursor))
+    parameters = {
+        **_values(s, search),
+        **_cursor_values(cursor),
+        "size": _max_rows(search),
+        "limit": max_numbers + 1,
+    }
+    if search.data:
+        numbers = [row.number for row in s.execute(statements.data, parameters) if _matches(search, row.data)]
     else:
-        numbers = list(s.scalars(asked.numbers, now))
+        numbers = list(s.scalars(statements.numbers, parameters))
     count = len(numbers)
-    if count > few:
-        count, numbers = count if ask.data else s.scalar(asked.size, now) or 0, []
-    return StoredEventCounts(count, numbers, _end(s, asked, now))
+    if count > max_numbers:
+        count, numbers = count if search.data else s.scalar(statements.size, parameters) or 0, []
+    return StoredEventCounts(count, numbers, _next_cursor(s, statements, parameters))
 
 
-def _most(ask: EventSearch) -> int:
-    return SCATTERED if _index(ask) else LOOKED_AT
+def _max_rows(search: EventSearch) -> int:
+    return MAX_SCANNED_SCATTERED if _index(search) else MAX_SCANNED
 
 
-def memories_since(s: Session, realm: str, number: int, limit: int) -> list[StoredEventRecord]:
-    """All events of a realm with greater numbers, in their order.
+def events_since(s: Session, realm: str, number: int, limit: int) -> list[StoredEventRecord]:
+    """The events of a realm with greater numbers, in their order.
 
     :param limit: most events
     """
     query = (
         select(*_COLUMNS)
-        .where(StoredEvent.realm_id == realm_number(s, realm), StoredEvent.number > number)
+        .where(StoredEvent.realm_id == realm_id_or_zero(s, realm), StoredEvent.number > number)
         .order_by(StoredEvent.number)
         .limit(limit)
     )
-    return [StoredEventRecord(row.number, realm, *row[1:]) for row in s.execute(query)]
+    return fetch_all(s, StoredEventRecord, query, realm=realm)
 
 
-def latest_memory(s: Session, realm: str) -> int:
-    """The number of the event that was written last; 0 when there never was one."""
+def latest_event_number(s: Session, realm: str) -> int:
+    """The number of the latest event of a realm; 0 if there never was one."""
     query = (
-        select(StoredEventCount.last)
-        .join(Realm, Realm.id == StoredEventCount.realm_id)
+        select(LastEventNumber.number)
+        .join(Realm, Realm.id == LastEventNumber.realm_id)
         .where(Realm.name == realm)
     )
     return s.scalar(query) or 0
 
 
 class StatementShape(NamedTuple):
-    """What a statement is made of, whatever the values are. To make one takes longer than the database does.
+    """All that statements depend on beside the values of parameters. Statements are cached by it.
 
-    :param by: what rows are found by, see :func:`_index`
-    :param prefixes: of source and kind, whether it is asked for by its beginning; ``None`` where it is not asked for
-    :param fields: of the data, how many are asked for
+    :param by: the condition whose index finds the rows, see :func:`_index`
+    :param prefixes: of source and kind: whether the condition is a prefix; ``None`` without a condition
+    :param fields: number of conditions on fields of the data
     """
 
     postgresql: bool
     by: str
     since: bool
     until: bool
-    placed: bool
+    after_cursor: bool
     prefixes: tuple[bool | None, bool | None]
     user: bool
     fields: int
-    general: bool
-    insider: bool
+    without_robot: bool
+    admin: bool
 
 
 class Statements(NamedTuple):
-    """Statements of one shape.
+    """Statements of one shape, for one slice of rows.
 
-    :param rows: of a part, some; ``numbers`` are those of some
-    :param data: what all of them hold, with their numbers
-    :param size: how many there are
-    :param end: the last row that was looked at, and the one behind it
+    :param rows: events that match, up to a limit; ``numbers`` only their numbers
+    :param data: number and data of all events that match
+    :param size: the number of events that match
+    :param end: the last row of the slice, and the row after it
     """
 
     rows: Select[Any]
@@ -169,79 +181,78 @@ class Statements(NamedTuple):
     end: Select[Any]
 
 
-def _shape(s: Session, ask: EventSearch, place: EventCursor | None) -> StatementShape:
-    names = (ask.source, ask.kind)
+def _shape(s: Session, search: EventSearch, cursor: EventCursor | None) -> StatementShape:
+    names = (search.source, search.kind)
     return StatementShape(
         s.get_bind().dialect.name == "postgresql",
-        _index(ask),
-        ask.since is not None,
-        ask.until is not None,
-        place is not None,
+        _index(search),
+        search.since is not None,
+        search.until is not None,
+        cursor is not None,
         (names[0] and names[0].prefix, names[1] and names[1].prefix),
-        ask.user is not None,
-        len(ask.data),
-        ask.general,
-        ask.insider,
+        search.user is not None,
+        len(search.data),
+        search.without_robot,
+        search.admin,
     )
 
 
-def _index(ask: EventSearch) -> str:
-    """What rows are found by: one robot, a source (which has a bounded number), a kind or a user; else the realm."""
-    if len(ask.robots) == 1 and not ask.general:
+def _index(search: EventSearch) -> str:
+    """The condition whose index finds the rows: robot, source, kind or user; empty for the realm and time alone."""
+    if len(search.robots) == 1 and not search.without_robot:
         return "robot"
-    if ask.source is not None and not ask.source.prefix:
+    if search.source is not None and not search.source.prefix:
         return "source"
-    if ask.kind is not None and not ask.kind.prefix:
+    if search.kind is not None and not search.kind.prefix:
         return "kind"
-    return "user" if ask.user is not None else ""
+    return "user" if search.user is not None else ""
 
 
-def _values(s: Session, ask: EventSearch) -> dict[str, Any]:
-    """What a statement is given."""
+def _values(s: Session, search: EventSearch) -> dict[str, Any]:
+    """Parameters of the statements."""
     values: dict[str, Any] = {
-        "realm": realm_number(s, ask.realm),
-        "robots": sorted(ask.robots),
-        "robot": next(iter(ask.robots), 0),
-        "user": ask.user,
-        "since": ask.since,
-        "until": ask.until,
+        "realm": realm_id_or_zero(s, search.realm),
+        "robots": sorted(search.robots),
+        "robot": next(iter(search.robots), 0),
+        "user": search.user,
+        "since": search.since,
+        "until": search.until,
     }
-    for what, name in (("source", ask.source), ("kind", ask.kind)):
+    for what, name in (("source", search.source), ("kind", search.kind)):
         if name is not None:
             values |= {what: name.text, f"{what}_length": len(name.text)}
-    for number, (field, value) in enumerate(ask.data):
+    for number, (field, value) in enumerate(search.data):
         key = canonical_json(field)
         text = f"{key}:{canonical_json(value)}"
         values |= {f"text_{number}": text, f"bare_{number}": f"{key}:{value}" if value.isascii() else text}
     return values
 
 
-def _place_values(place: EventCursor | None) -> dict[str, Any]:
-    return {} if place is None else {"place_at": place.at, "place_number": place.number}
+def _cursor_values(cursor: EventCursor | None) -> dict[str, Any]:
+    return {} if cursor is None else {"cursor_at": cursor.at, "cursor_number": cursor.number}
 
 
 @lru_cache(maxsize=1024)
-def _asked(shape: StatementShape) -> Statements:
-    part, size = _part(shape), bindparam("size", type_=Integer)
-    wanted, order = _wanted(shape, part), (part.c.at.desc(), part.c.number.desc())
-    room = bindparam("room", type_=Integer)
+def _statements(shape: StatementShape) -> Statements:
+    part, size = _slice(shape), bindparam("size", type_=Integer)
+    wanted, order = _conditions(shape, part), (part.c.at.desc(), part.c.number.desc())
+    limit = bindparam("limit", type_=Integer)
     return Statements(
-        select(part).where(*wanted).order_by(*order).limit(room),
-        select(part.c.number).where(*wanted).limit(room),
+        select(part).where(*wanted).order_by(*order).limit(limit),
+        select(part.c.number).where(*wanted).limit(limit),
         select(part.c.number, part.c.data).where(*wanted),
         select(func.count()).select_from(part).where(*wanted),
-        # Of the index alone: to read the rows of a source that is spread over a large memory takes far longer.
+        # Read from the index alone: reading scattered rows of a source takes far longer.
         _rows(shape, StoredEvent.at, StoredEvent.number).limit(2).offset(size - 1),
     )
 
 
-def _part(shape: StatementShape) -> Subquery:
-    """So many rows."""
+def _slice(shape: StatementShape) -> Subquery:
     return _rows(shape, *_COLUMNS).limit(bindparam("size", type_=Integer)).subquery()
 
 
 def _rows(shape: StatementShape, *columns: Any) -> Select[Any]:
-    """Rows by the index on what is most exact, the newest first."""
+    """Rows by the index of :func:`_index`, the newest first."""
     conditions: list[ColumnElement[bool]] = [StoredEvent.realm_id == bindparam("realm")]
     column = {
         "robot": StoredEvent.robot_id,
@@ -255,16 +266,15 @@ def _rows(shape: StatementShape, *columns: Any) -> Select[Any]:
         conditions.append(StoredEvent.at >= bindparam("since"))
     if shape.until:
         conditions.append(StoredEvent.at < bindparam("until"))
-    if shape.placed:
-        at, number = bindparam("place_at", type_=Double), bindparam("place_number", type_=BigInteger)
-        # Twice: databases find the first by the index, of the second not all do.
+    if shape.after_cursor:
+        at, number = bindparam("cursor_at", type_=Double), bindparam("cursor_number", type_=BigInteger)
+        # Both: not all databases use the index for the second condition.
         conditions.append(StoredEvent.at <= at)
         conditions.append(tuple_(StoredEvent.at, StoredEvent.number) < tuple_(at, number))
     return select(*columns).where(*conditions).order_by(StoredEvent.at.desc(), StoredEvent.number.desc())
 
 
-def _wanted(shape: StatementShape, part: Subquery) -> list[ColumnElement[bool]]:
-    """What has to be true of the rows of a part."""
+def _conditions(shape: StatementShape, part: Subquery) -> list[ColumnElement[bool]]:
     columns = part.c
     conditions = [_visible(shape, part)]
     for column, what, prefix in zip(
@@ -272,13 +282,13 @@ def _wanted(shape: StatementShape, part: Subquery) -> list[ColumnElement[bool]]:
     ):
         if prefix is not None:
             length = bindparam(f"{what}_length", type_=Integer)
-            # Not LIKE: SQLite's takes great letters for small ones.
+            # Not LIKE, which ignores case in SQLite.
             conditions.append((func.substr(column, 1, length) if prefix else column) == bindparam(what))
     if shape.user:
-        conditions.append(columns.user_name == bindparam("user"))
+        conditions.append(columns.user == bindparam("user"))
     holds = func.strpos if shape.postgresql else func.instr
     for number in range(shape.fields):
-        # What holds none of these can't fit. What does is looked at more closely.
+        # Rows without either text cannot match; the others are decoded and compared in _matches.
         texts = (bindparam(f"{each}_{number}", type_=Text) for each in ("text", "bare"))
         conditions.append(or_(*(holds(columns.data, each) > 0 for each in texts)))
     return conditions
@@ -287,31 +297,34 @@ def _wanted(shape: StatementShape, part: Subquery) -> list[ColumnElement[bool]]:
 def _visible(shape: StatementShape, part: Subquery) -> ColumnElement[bool]:
     columns = part.c
     about = columns.robot_id.in_(bindparam("robots", expanding=True))
-    if not shape.general:
+    if not shape.without_robot:
         return about
-    if shape.insider:
+    if shape.admin:
         return or_(about, columns.robot_id.is_(None))
-    source, kind = func.substr(columns.source, 1, len(OURS)), func.substr(columns.kind, 1, len(LOGIN))
-    return or_(about, and_(columns.robot_id.is_(None), source != OURS, kind != LOGIN))
+    source, kind = (
+        func.substr(columns.source, 1, len(RELAY_SOURCE)),
+        func.substr(columns.kind, 1, len(LOGIN_KIND)),
+    )
+    return or_(about, and_(columns.robot_id.is_(None), source != RELAY_SOURCE, kind != LOGIN_KIND))
 
 
-def _end(s: Session, asked: Statements, values: dict[str, Any]) -> EventCursor | None:
-    """Where a part ends; ``None`` when there is nothing behind it."""
-    last = s.execute(asked.end, values).all()
-    return EventCursor(*last[0]) if len(last) == 2 else None
+def _next_cursor(s: Session, statements: Statements, parameters: dict[str, Any]) -> EventCursor | None:
+    """The cursor at the end of a slice; ``None`` if there is no row after it."""
+    last = s.execute(statements.end, parameters).all()
+    return EventCursor(last[0].at, last[0].number) if len(last) == 2 else None
 
 
-def realm_number(s: Session, name: str) -> int:
-    """The number of a realm; 0 when there is none."""
+def realm_id_or_zero(s: Session, name: str) -> int:
+    """The number of a realm; 0 if it does not exist."""
     return s.scalar(select(Realm.id).where(Realm.name == name)) or 0
 
 
-def _fits(ask: EventSearch, data: str) -> bool:
-    return not ask.data or data_fits(ask.data, json.loads(data))
+def _matches(search: EventSearch, data: str) -> bool:
+    return not search.data or data_matches(search.data, json.loads(data))
 
 
-def data_fits(wanted: Iterable[tuple[str, str]], data: Mapping[str, Any]) -> bool:
-    """Whether fields have these values: as text, or as what JSON writes for anything else."""
+def data_matches(wanted: Iterable[tuple[str, str]], data: Mapping[str, Any]) -> bool:
+    """Whether fields have these values. Values other than text are compared as JSON."""
     return all(
         field in data
         and value == (data[field] if isinstance(data[field], str) else canonical_json(data[field]))
@@ -319,5 +332,5 @@ def data_fits(wanted: Iterable[tuple[str, str]], data: Mapping[str, Any]) -> boo
     )
 
 
-def _record(ask: EventSearch, row: Any) -> StoredEventRecord:
-    return StoredEventRecord(row.number, ask.realm, *row[1:])
+def _record(search: EventSearch, row: Any) -> StoredEventRecord:
+    return record_of(StoredEventRecord, row, realm=search.realm)

@@ -1,4 +1,4 @@
-"""Programs with key and secret, and families of tokens that are refreshed (RFC 6749)."""
+"""OAuth clients, and families of tokens that are refreshed (RFC 6749)."""
 
 from __future__ import annotations
 
@@ -6,56 +6,55 @@ from sqlalchemy import Select, delete, insert, literal, null, or_, select, updat
 from sqlalchemy.orm import Session
 
 from relay_db.models import AccessToken, OAuthClient, Realm, TokenFamily, User
-from relay_db.names import findable_hex, normalise
-from relay_db.names import label as checked_label
-from relay_db.queries.records import IssuedRecord, OAuthClientRecord
-from relay_db.queries.state import bump
-from relay_db.queries.users import check_unchanged, live_user
+from relay_db.names import checked_label, normalise, normalise_hex
+from relay_db.queries.records import IssuedRecord, OAuthClientRecord, fetch_all, fetch_one, record_of
+from relay_db.queries.revision import bump
+from relay_db.queries.users import check_password_unchanged, live_user
 from relay_protocol.errors import Invalid, NotFound
 
-PROGRAMS_OF_ONE = 256
-"""Programs one user may have."""
+MAX_OAUTH_CLIENTS = 256
+"""Most OAuth clients of one user."""
 
-FAMILIES_OF_ONE = 64
-"""Families of one user at a time; the oldest ends when there is one more."""
+MAX_TOKEN_FAMILIES = 64
+"""Most token families of one user; one more ends the oldest."""
 
 
-def add_program(
-    s: Session, user_id: int, key: str, verifier: str, *, scope: str | None, label: str, now: float
+def add_oauth_client(
+    s: Session, user_id: int, key: str, digest_ha1: str, *, scope: str | None, label: str, now: float
 ) -> int:
-    """Keep a new program and return its number, which is never given out again.
+    """Store a new OAuth client; returns its number, which is never reused.
 
-    :param key: 64 characters or fewer that nobody can guess or choose
-    :param verifier: H(A1) of RFC 7616 section 3.4.2 by SHA-256, in hex
-    :param scope: what its tokens may be used for at most; ``None`` for all that its user may
+    :param key: random, at most 64 characters
+    :param digest_ha1: H(A1) of RFC 7616 section 3.4.2 by SHA-256, in hex
+    :param scope: the widest scope of its tokens; ``None`` for no limit
     :raises NotFound: no such user
-    :raises Invalid: the label can't be kept, or the user has too many
+    :raises Invalid: the label is not valid, or the user has too many
     """
     if s.scalar(select(User.id).where(User.id == user_id)) is None:
         raise NotFound("there is no such user")
-    if len(list_programs(s, user_id)) >= PROGRAMS_OF_ONE:
-        raise Invalid(f"a user may have {PROGRAMS_OF_ONE} programs; remove some first")
+    if len(list_oauth_clients(s, user_id)) >= MAX_OAUTH_CLIENTS:
+        raise Invalid(f"a user may have {MAX_OAUTH_CLIENTS} OAuth clients; remove some first")
     values = {
         "user_id": user_id,
         "key": key,
-        "verifier": verifier,
+        "digest_ha1": digest_ha1,
         "scope": scope,
-        "label": checked_label(label, "label of a program"),
+        "label": checked_label(label, "label of an OAuth client"),
         "created": now,
     }
     return s.scalars(insert(OAuthClient).values(**values).returning(OAuthClient.id)).one()
 
 
-def find_program(s: Session, key: str) -> OAuthClientRecord | None:
-    """The program of that key, unless its user is disabled."""
-    query = _programs().where(OAuthClient.key == key, live_user())
-    # Text from anyone: what can't be a key must not reach the database.
+def find_oauth_client(s: Session, key: str) -> OAuthClientRecord | None:
+    """The OAuth client with this key, unless its user is disabled."""
+    query = _oauth_clients().where(OAuthClient.key == key, live_user())
+    # The key comes from the network: text that the database may fail on must not reach it.
     row = s.execute(query).one_or_none() if key.isascii() and key.isprintable() else None
-    return None if row is None else OAuthClientRecord(*row)
+    return None if row is None else record_of(OAuthClientRecord, row)
 
 
-def program_in(s: Session, key: str, realm: str) -> int | None:
-    """The number of the program of that key, if its user is of the realm; also while he is disabled."""
+def oauth_client_in(s: Session, key: str, realm: str) -> int | None:
+    """The number of the OAuth client with this key, if its user belongs to the realm; also of a disabled user."""
     if not (key.isascii() and key.isprintable()):
         return None
     query = (
@@ -66,31 +65,31 @@ def program_in(s: Session, key: str, realm: str) -> int | None:
     return s.scalar(query.where(OAuthClient.key == key, Realm.name == normalise(realm)))
 
 
-def list_programs(s: Session, user_id: int | None = None) -> list[OAuthClientRecord]:
-    """All programs, of one user or of all, oldest first."""
-    query = _programs().order_by(OAuthClient.id)
+def list_oauth_clients(s: Session, user_id: int | None = None) -> list[OAuthClientRecord]:
+    """All OAuth clients, of one user or of all, oldest first."""
+    query = _oauth_clients().order_by(OAuthClient.id)
     if user_id is not None:
         query = query.where(OAuthClient.user_id == user_id)
-    return [OAuthClientRecord(*row) for row in s.execute(query)]
+    return fetch_all(s, OAuthClientRecord, query)
 
 
-def remove_program(s: Session, program_id: int) -> bool:
-    """Remove a program; the tokens it was given end with it. False if there is none of that number."""
+def remove_oauth_client(s: Session, oauth_client_id: int) -> bool:
+    """Remove an OAuth client and the tokens issued to it; false if there is none of this number."""
     bump(s)
-    gone = delete(OAuthClient).where(OAuthClient.id == program_id).returning(OAuthClient.id)
-    return s.scalar(gone) is not None
+    statement = delete(OAuthClient).where(OAuthClient.id == oauth_client_id).returning(OAuthClient.id)
+    return s.scalar(statement) is not None
 
 
-def program_label(s: Session, token_id: int) -> str | None:
-    """What the program is called that a token was given to; ``None`` for a token of no program."""
+def oauth_client_label(s: Session, token_id: int) -> str | None:
+    """The label of the OAuth client that a token was issued to; ``None`` for other tokens."""
     return s.scalar(
         select(OAuthClient.label)
-        .join(AccessToken, AccessToken.program_id == OAuthClient.id)
+        .join(AccessToken, AccessToken.oauth_client_id == OAuthClient.id)
         .where(AccessToken.id == token_id)
     )
 
 
-def open_family(
+def open_token_family(
     s: Session,
     user_id: int,
     refresh_hash: str,
@@ -100,14 +99,14 @@ def open_family(
     expires: float,
     now: float,
 ) -> int:
-    """Begin a family of tokens for a user who has just proved the password; its number.
+    """Begin a family of tokens for a user who has just logged in; returns its number.
 
-    :param password_hash: what was stored when the user was proved
-    :raises Refused: another is stored now, or the user was disabled or removed
+    :param password_hash: the hash that was stored when the password was checked
+    :raises Refused: another one is stored now, or the user was disabled or removed
     """
-    check_unchanged(s, user_id, password_hash)
+    check_password_unchanged(s, user_id, password_hash)
     oldest = select(TokenFamily.id).where(TokenFamily.user_id == user_id).order_by(TokenFamily.id.desc())
-    over = s.scalars(oldest.offset(FAMILIES_OF_ONE - 1)).all()
+    over = s.scalars(oldest.offset(MAX_TOKEN_FAMILIES - 1)).all()
     if over:
         bump(s)
         s.execute(delete(TokenFamily).where(TokenFamily.id.in_(over)))
@@ -121,12 +120,12 @@ def open_family(
     return s.scalars(insert(TokenFamily).values(**values).returning(TokenFamily.id)).one()
 
 
-def refresh_family(s: Session, refresh_hash: str, new_hash: str, now: float) -> IssuedRecord | None:
-    """Replace a refresh token; what it stands for, or ``None`` if it is good for nothing.
+def refresh_token_family(s: Session, refresh_hash: str, new_hash: str, now: float) -> IssuedRecord | None:
+    """Replace a refresh token; ``None`` if it is not valid.
 
-    One that was replaced before is a copy: then the whole family ends.
+    A token that was replaced before is a copy: it ends the whole family (RFC 9700 section 4.14.2).
     """
-    found = findable_hex(refresh_hash)
+    found = normalise_hex(refresh_hash)
     copied = s.scalar(delete(TokenFamily).where(TokenFamily.former_hash == found).returning(TokenFamily.id))
     if copied is not None:
         bump(s)
@@ -138,32 +137,32 @@ def refresh_family(s: Session, refresh_hash: str, new_hash: str, now: float) -> 
         .values(refresh_hash=new_hash, former_hash=found)
         .returning(TokenFamily.id)
     )
-    # Of two that come at once, only one replaces it.
+    # Of two simultaneous requests only one replaces it.
     family = s.scalar(replaced)
-    return None if family is None else issued(s, new_hash, now)
+    return None if family is None else issued_token(s, new_hash, now)
 
 
-def issued(s: Session, token_hash: str, now: float) -> IssuedRecord | None:
-    """What an access or a refresh token stands for (RFC 7662).
+def issued_token(s: Session, token_hash: str, now: float) -> IssuedRecord | None:
+    """An access or refresh token (RFC 7662).
 
     ``None`` if it is unknown, expired or revoked, or its user disabled.
     """
-    found = findable_hex(token_hash)
+    found = normalise_hex(token_hash)
     access = (
         select(
-            literal("access"),
-            User.id,
-            User.name,
-            Realm.name,
+            literal("access").label("kind"),
+            AccessToken.user_id,
+            User.name.label("user"),
+            Realm.name.label("realm"),
             AccessToken.scope,
-            OAuthClient.key,
+            OAuthClient.key.label("client_id"),
             AccessToken.created,
             AccessToken.expires,
             AccessToken.family_id,
         )
         .join(User, User.id == AccessToken.user_id)
         .join(Realm, Realm.id == User.realm_id)
-        .outerjoin(OAuthClient, OAuthClient.id == AccessToken.program_id)
+        .outerjoin(OAuthClient, OAuthClient.id == AccessToken.oauth_client_id)
         .where(
             AccessToken.token_hash == found,
             AccessToken.kind == "access",
@@ -173,63 +172,62 @@ def issued(s: Session, token_hash: str, now: float) -> IssuedRecord | None:
     )
     refresh = (
         select(
-            literal("refresh"),
-            User.id,
-            User.name,
-            Realm.name,
+            literal("refresh").label("kind"),
+            TokenFamily.user_id,
+            User.name.label("user"),
+            Realm.name.label("realm"),
             TokenFamily.scope,
-            null(),
+            null().label("client_id"),
             TokenFamily.created,
             TokenFamily.expires,
-            TokenFamily.id,
+            TokenFamily.id.label("family_id"),
         )
         .join(User, User.id == TokenFamily.user_id)
         .join(Realm, Realm.id == User.realm_id)
         .where(TokenFamily.refresh_hash == found, TokenFamily.expires > now, live_user())
     )
-    row = s.execute(access).one_or_none() or s.execute(refresh).one_or_none()
-    return None if row is None else IssuedRecord(*row)
+    return fetch_one(s, IssuedRecord, access) or fetch_one(s, IssuedRecord, refresh)
 
 
-def revoke_issued(s: Session, token_hash: str, realm: str, program: str | None = None) -> bool:
-    """Make a token worthless, with a refresh token all of its family (RFC 7009); false if there was none.
+def revoke_issued(s: Session, token_hash: str, realm: str, client_id: str | None = None) -> bool:
+    """Revoke a token, with a refresh token its whole family (RFC 7009); false if there was none.
 
-    :param realm: whose token it has to be
-    :param program: key of the program to which it may have been given instead, in whatever realm
+    :param realm: the realm that the token must belong to
+    :param client_id: key of an OAuth client, whose own tokens may belong to any realm
     """
-    found = findable_hex(token_hash)
+    found = normalise_hex(token_hash)
     users = select(User.id).join(Realm, Realm.id == User.realm_id).where(Realm.name == realm)
     token = delete(AccessToken).where(
         AccessToken.token_hash == found,
         AccessToken.kind == "access",
         or_(
             AccessToken.user_id.in_(users),
-            AccessToken.program_id.in_(select(OAuthClient.id).where(OAuthClient.key == program)),
+            AccessToken.oauth_client_id.in_(select(OAuthClient.id).where(OAuthClient.key == client_id)),
         ),
     )
     family = delete(TokenFamily).where(
         or_(TokenFamily.refresh_hash == found, TokenFamily.former_hash == found),
         TokenFamily.user_id.in_(users),
     )
-    gone = [
+    revoked = [
         s.scalar(token.returning(AccessToken.id)),
         s.scalar(family.returning(TokenFamily.id)),
     ]
-    if not any(gone):
+    if not any(revoked):
         return False
     bump(s)
     return True
 
 
-def _programs() -> Select[int, int, str, str, str, str, str | None, str, float]:
+def _oauth_clients() -> Select[int, int, str, str, str, str, str | None, str, float]:
     return (
         select(
             OAuthClient.id,
-            User.id,
-            User.name,
-            Realm.name,
+            OAuthClient.user_id,
+            User.name.label("user"),
+            Realm.name.label("realm"),
             OAuthClient.key,
-            OAuthClient.verifier,
+            OAuthClient.digest_ha1,
             OAuthClient.scope,
             OAuthClient.label,
             OAuthClient.created,

@@ -1,32 +1,32 @@
-"""Realms: worlds of their own, in each of which names are unique."""
+"""Realms: names are unique within one, and users of one realm do not see others."""
 
 from __future__ import annotations
 
-from sqlalchemy import delete, exists, insert, select, update
+from sqlalchemy import Select, delete, exists, insert, select, update
 from sqlalchemy.orm import Session
 
 from relay_db.models import (
-    DirectoryEntry,
     Group,
+    LastEventNumber,
     Realm,
     RobotGroup,
     RobotRealm,
+    ServiceRegistryEntry,
     StoredEvent,
-    StoredEventCount,
     User,
 )
 from relay_db.names import normal_name, normalise
-from relay_db.queries.records import RealmRecord
-from relay_db.queries.state import bump
+from relay_db.queries.records import RealmRecord, fetch_all, fetch_one
+from relay_db.queries.revision import bump
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.realms import DEFAULT_REALM
 
-MOST_DAYS = 3650
-"""The longest that events are kept."""
+MAX_EVENT_DAYS = 3650
+"""Most days that events are stored."""
 
 
 def add_realm(s: Session, name: str) -> RealmRecord:
-    """:raises Invalid: the name can't be, or is taken"""
+    """:raises Invalid: the name is not valid, or is taken"""
     name = normal_name(name, "name of a realm")
     if s.scalar(select(Realm.id).where(Realm.name == name)) is not None:
         raise Invalid(f"there is a realm '{name}' already")
@@ -36,19 +36,19 @@ def add_realm(s: Session, name: str) -> RealmRecord:
 
 
 def remove_realm(s: Session, name: str) -> None:
-    """Remove a realm in which nobody and nothing is left, with what its memory and its directory hold.
+    """Remove a realm without users, groups and robots, with its stored events and registry entries.
 
     :raises NotFound: no such realm
-    :raises Refused: users, groups or robots are in it, or it is the one that every relay has
+    :raises Refused: it has users, groups or robots, or it is the default realm
     """
     bump(s)
-    # On PostgreSQL who writes to the realm's memory is done by now, or finds it gone.
-    gone = s.scalar(select(Realm.id).where(Realm.name == normalise(name)).with_for_update())
-    if gone is None:
+    # On PostgreSQL writers of its events have committed by now, or will find the realm removed.
+    number = s.scalar(select(Realm.id).where(Realm.name == normalise(name)).with_for_update())
+    if number is None:
         raise NotFound("there is no such realm")
     if normalise(name) == DEFAULT_REALM:
-        raise Refused(f"the realm '{DEFAULT_REALM}' stays: names without a realm are of it")
-    left = [
+        raise Refused(f"the realm '{DEFAULT_REALM}' cannot be removed: names without a realm belong to it")
+    remaining = [
         what
         for what, kind in (
             ("users", User),
@@ -56,26 +56,27 @@ def remove_realm(s: Session, name: str) -> None:
             ("robots", RobotRealm),
             ("groups of robots", RobotGroup),
         )
-        if s.scalar(select(exists().where(kind.realm_id == gone)))
+        if s.scalar(select(exists().where(kind.realm_id == number)))
     ]
-    if left:
-        raise Refused(f"there are {' and '.join(left)} in the realm '{normalise(name)}'; remove them first")
-    for kept in (DirectoryEntry, StoredEvent, StoredEventCount):
-        s.execute(delete(kept).where(kept.realm_id == gone))
-    s.execute(delete(Realm).where(Realm.id == gone))
+    if remaining:
+        raise Refused(
+            f"there are {' and '.join(remaining)} in the realm '{normalise(name)}'; remove them first"
+        )
+    for table in (ServiceRegistryEntry, StoredEvent, LastEventNumber):
+        s.execute(delete(table).where(table.realm_id == number))
+    s.execute(delete(Realm).where(Realm.id == number))
 
 
 def list_realms(s: Session) -> list[RealmRecord]:
     """All realms, by name."""
     query = select(Realm.id, Realm.name, Realm.events_days).order_by(Realm.name)
-    return [RealmRecord(*row) for row in s.execute(query)]
+    return fetch_all(s, RealmRecord, query)
 
 
 def find_realm(s: Session, name: str) -> RealmRecord | None:
     """The realm of that name."""
     query = select(Realm.id, Realm.name, Realm.events_days).where(Realm.name == normalise(name))
-    row = s.execute(query).one_or_none()
-    return None if row is None else RealmRecord(*row)
+    return fetch_one(s, RealmRecord, query)
 
 
 def realm_id(s: Session, name: str) -> int:
@@ -86,19 +87,35 @@ def realm_id(s: Session, name: str) -> int:
     return found
 
 
-def robot_is_of(s: Session, robot_id: int, realm_id: int) -> bool:
-    """Whether a robot is of a realm: it is its own, or it is shared with that."""
+def robot_in_realm(s: Session, robot_id: int, realm_id: int) -> bool:
+    """Whether a robot belongs to a realm: its own, or one that it is shared with."""
     of = (RobotRealm.robot_id == robot_id) & (RobotRealm.realm_id == realm_id)
     return bool(s.scalar(select(exists().where(of))))
 
 
-def keep_events(s: Session, name: str, days: float | None) -> None:
-    """Say how long a realm's memory keeps events.
+def set_event_retention(s: Session, name: str, days: float | None) -> None:
+    """Set how long events of a realm are stored.
 
-    :param days: ``None``: as long as that of the whole relay
-    :raises Invalid: not more than 0 days, or more than :data:`MOST_DAYS`
+    :param days: ``None`` for the setting of the relay
+    :raises Invalid: not more than 0 days, or more than :data:`MAX_EVENT_DAYS`
     :raises NotFound: no such realm
     """
-    if days is not None and not 0 < days <= MOST_DAYS:
-        raise Invalid(f"events are kept for more than 0 days, and for {MOST_DAYS} at most")
+    if days is not None and not 0 < days <= MAX_EVENT_DAYS:
+        raise Invalid(
+            f"the days for which events are stored must be more than 0 and at most {MAX_EVENT_DAYS}"
+        )
     s.execute(update(Realm).where(Realm.id == realm_id(s, name)).values(events_days=days))
+
+
+# --- groups of users and of robots ------------------------------------------------------------------------
+
+
+def groups_with_realm(table: type[Group] | type[RobotGroup]) -> Select[int, str, str]:
+    """Groups of users or of robots: number, name and name of the realm."""
+    return select(table.id, table.name, Realm.name.label("realm")).join(Realm, Realm.id == table.realm_id)
+
+
+def numbers_by_name(s: Session, table: type[Group] | type[RobotGroup], realm: str) -> dict[str, int]:
+    """The numbers of the groups of a realm, by name."""
+    rows = s.execute(groups_with_realm(table).where(Realm.name == normalise(realm)))
+    return {row.name: row.id for row in rows}

@@ -1,4 +1,4 @@
-"""Who may do what on which robot."""
+"""Rights of users and groups on robots."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from sqlalchemy import ColumnElement, delete, func, insert, or_, select
 from sqlalchemy.orm import Session
 
 from relay_db.models import Group, Membership, Realm, Right, Robot, RobotRealm, User
-from relay_db.queries.realms import robot_is_of
-from relay_db.queries.records import RightRecord, RobotRecord
-from relay_db.queries.state import bump
+from relay_db.queries.realms import robot_in_realm
+from relay_db.queries.records import RightRecord, RobotRecord, record_of
+from relay_db.queries.revision import bump
 from relay_db.queries.users import live_user
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.rights import Grant, Level, parse_level, parse_pattern
-from relay_protocol.text import legible
+from relay_protocol.text import is_printable
 
 PATTERNS = 64
-"""Most allow or deny patterns of one right: all of them are asked for every new resource."""
+"""Most allow and most deny patterns of one right; all are matched against every new resource."""
 
 _PATTERN_LENGTH = 512
 
@@ -34,16 +34,16 @@ def grant_right(
     allow: Iterable[str] = (),
     deny: Iterable[str] = (),
 ) -> None:
-    """Give a right to a user or a group; it replaces the one the same holder has on the robot.
+    """Grant a right to a user or a group. It replaces the holder's right on the robot.
 
     :param allow: patterns ``operation:resource`` allowed beyond the level
-    :param deny: patterns denied in spite of everything
-    :raises Invalid: not exactly one holder, a pattern that is none, or a holder of a realm that the robot is not of
+    :param deny: patterns denied even if something else allows them
+    :raises Invalid: not exactly one holder, an invalid pattern, or the robot does not belong to the holder's realm
     :raises NotFound: no such robot, user or group
     """
     level = parse_level(str(level))
     patterns = _patterns(allow), _patterns(deny)
-    # First: from here on nobody takes the robot out of the realm.
+    # First, so that the robot cannot be taken out of the realm meanwhile.
     bump(s)
     _check_realms(s, robot_id, user_id, group_id)
     s.execute(delete(Right).where(_held(robot_id, user_id, group_id)))
@@ -62,14 +62,14 @@ def grant_right(
 def revoke_right(
     s: Session, robot_id: int, *, user_id: int | None = None, group_id: int | None = None
 ) -> bool:
-    """Take the right of a user or a group on a robot away; false if there was none.
+    """Revoke the right of a user or a group on a robot; false if there was none.
 
     :raises Invalid: not exactly one holder
     """
     _one_holder(user_id, group_id)
     bump(s)
-    gone = delete(Right).where(_held(robot_id, user_id, group_id)).returning(Right.id)
-    return s.scalar(gone) is not None
+    statement = delete(Right).where(_held(robot_id, user_id, group_id)).returning(Right.id)
+    return s.scalar(statement) is not None
 
 
 def list_rights(
@@ -80,7 +80,7 @@ def list_rights(
     group_id: int | None = None,
     ids: Collection[int] | None = None,
 ) -> list[RightRecord]:
-    """Rights as they were given, by robot and holder; with ``user_id`` also those through its groups.
+    """Rights as they were granted, by robot and holder. With ``user_id`` also rights through groups.
 
     :param ids: only of these numbers
     """
@@ -104,29 +104,19 @@ def list_rights(
     if group_id is not None:
         query = query.where(Right.group_id == group_id)
     if user_id is not None:
-        query = query.where(of_user(user_id))
+        query = query.where(held_by_user(user_id))
     if ids is not None:
         query = query.where(Right.id.in_(ids))
     return [
-        RightRecord(
-            row.id,
-            row.robot_id,
-            row.robot,
-            row.realm,
-            row.user,
-            row.group,
-            Level(row.level),
-            tuple(row.allow),
-            tuple(row.deny),
-        )
+        record_of(RightRecord, row, level=Level(row.level), allow=tuple(row.allow), deny=tuple(row.deny))
         for row in s.execute(query)
     ]
 
 
-def right_held(
+def get_right(
     s: Session, robot_id: int, *, user_id: int | None = None, group_id: int | None = None
 ) -> RightRecord | None:
-    """The right that a user or a group itself has on a robot.
+    """The right of a user or a group on a robot, without rights through groups.
 
     :raises Invalid: not exactly one holder
     """
@@ -136,9 +126,9 @@ def right_held(
 
 
 def grants_for(s: Session, user_id: int, robot_id: int) -> list[Grant]:
-    """All a user has on a robot: its own right, those of its groups, and an administrator's.
+    """All grants of a user on a robot: its own, those of its groups, and an administrator's.
 
-    A disabled user, or one of a realm that the robot is not of, has none.
+    A disabled user has none, nor has a user of a realm that the robot does not belong to.
     """
     return _grants(s, user_id, robot_id).get(robot_id, [])
 
@@ -147,14 +137,14 @@ def robots_with_grants(s: Session, user_id: int) -> list[tuple[RobotRecord, list
     """The robots on which a user has at least one right, by name."""
     grants = _grants(s, user_id, None)
     robots = s.execute(
-        select(Robot.id, Robot.name, Realm.name, Robot.description)
+        select(Robot.id, Robot.name, Realm.name.label("realm"), Robot.description)
         .join(Realm, Realm.id == Robot.realm_id)
         .join(RobotRealm, RobotRealm.robot_id == Robot.id)
         .join(User, User.realm_id == RobotRealm.realm_id)
         .where(User.id == user_id)
         .order_by(Robot.name)
     )
-    return [(RobotRecord(*row), grants[row.id]) for row in robots if row.id in grants]
+    return [(record_of(RobotRecord, row), grants[row.id]) for row in robots if row.id in grants]
 
 
 def _grants(s: Session, user_id: int, robot_id: int | None) -> dict[int, list[Grant]]:
@@ -173,7 +163,7 @@ def _grants(s: Session, user_id: int, robot_id: int | None) -> dict[int, list[Gr
         select(Right.robot_id, Right.level, Right.allow, Right.deny, Group.name.label("group"))
         .join(RobotRealm, (RobotRealm.robot_id == Right.robot_id) & (RobotRealm.realm_id == user.realm_id))
         .outerjoin(Group, Group.id == Right.group_id)
-        .where(of_user(user_id))
+        .where(held_by_user(user_id))
         .order_by(Right.id)
     )
     for row in s.execute(rights if robot_id is None else rights.where(Right.robot_id == robot_id)):
@@ -182,14 +172,14 @@ def _grants(s: Session, user_id: int, robot_id: int | None) -> dict[int, list[Gr
     return grants
 
 
-def of_user(user_id: int) -> ColumnElement[bool]:
+def held_by_user(user_id: int) -> ColumnElement[bool]:
     """The rights of a user, also through groups."""
     groups = select(Membership.group_id).where(Membership.user_id == user_id)
     return or_(Right.user_id == user_id, Right.group_id.in_(groups))
 
 
 def with_holders(query: Any) -> Any:
-    """Rights with the users or groups who hold them, and the realms of these."""
+    """Rights with the users or groups that hold them, and the realms of these."""
     return (
         query.outerjoin(User, User.id == Right.user_id)
         .outerjoin(Group, Group.id == Right.group_id)
@@ -217,8 +207,8 @@ def _check_realms(s: Session, robot_id: int, user_id: int | None, group_id: int 
         holder_realm = s.scalar(select(Group.realm_id).where(Group.id == group_id))
     if holder_realm is None:
         raise NotFound("there is no such user or group")
-    if not robot_is_of(s, robot_id, holder_realm):
-        raise Invalid("the robot is not of the realm of the holder of the right")
+    if not robot_in_realm(s, robot_id, holder_realm):
+        raise Invalid("the robot does not belong to the realm of the holder of the right")
 
 
 def _patterns(texts: Iterable[str]) -> list[str]:
@@ -226,6 +216,6 @@ def _patterns(texts: Iterable[str]) -> list[str]:
     if len(patterns) > PATTERNS:
         raise Invalid(f"a right has at most {PATTERNS} allow and {PATTERNS} deny patterns")
     for each in patterns:
-        if len(each) > _PATTERN_LENGTH or not legible(each):
+        if len(each) > _PATTERN_LENGTH or not is_printable(each):
             raise Invalid(f"a pattern is one printable line of at most {_PATTERN_LENGTH} characters")
     return patterns

@@ -1,4 +1,4 @@
-"""Orders to stop, kept until the robot has confirmed them: they outlive the relay."""
+"""Orders to stop, stored until the robot has confirmed them, also while no relay runs."""
 
 from __future__ import annotations
 
@@ -7,34 +7,62 @@ from sqlalchemy.orm import Session
 
 from relay_db.models import Robot, StopOrder
 from relay_db.names import sanitise
-from relay_db.queries.records import StopRecord
-from relay_db.queries.state import bump
+from relay_db.queries.records import StopRecord, fetch_all
+from relay_db.queries.revision import bump
 from relay_protocol.errors import NotFound
-from relay_protocol.limits import WORDS
+from relay_protocol.limits import REASON_LENGTH, STOP_ID_LENGTH
 
 
-def order_stop(s: Session, robot_id: int, by: str, why: str, at: float, *, tell: bool = False) -> StopRecord:
-    """The robot is to stop; an order that it has not confirmed yet is replaced.
+def order_stop(
+    s: Session,
+    robot_id: int,
+    by: str,
+    why: str,
+    at: float,
+    stop_id: str = "",
+    *,
+    announce: bool = False,
+) -> StopRecord:
+    """Store an order to stop. It replaces one that the robot has not confirmed yet.
 
-    :param by: who orders it, for people
+    :param by: name of the user, for display
+    :param why: the reason, cut to :data:`relay_protocol.limits.REASON_LENGTH`
     :param at: Unix seconds
-    :param tell: a relay that runs is to look at once
+    :param stop_id: see :class:`StopRecord`
+    :param announce: whether to count up the revision, so that other relays read it at once
     :raises NotFound: no such robot
     """
-    if tell:
+    if announce:
+        # First, as in every change: other transactions lock in this order.
         bump(s)
     if s.scalar(select(Robot.id).where(Robot.id == robot_id).with_for_update()) is None:
         raise NotFound("there is no such robot")
     s.execute(delete(StopOrder).where(StopOrder.robot_id == robot_id))
-    order = StopRecord(robot_id, sanitise(by), sanitise(why, WORDS), float(at))
+    reason, stop_id = sanitise(why, REASON_LENGTH), sanitise(stop_id, STOP_ID_LENGTH)
+    order = StopRecord(robot_id, sanitise(by), reason, float(at), stop_id)
     s.execute(insert(StopOrder).values(**order._asdict()))
     return order
 
 
-def stop_told(s: Session, robot_id: int, at: float | None = None) -> bool:
-    """The order given at this moment is not to be told any more; whether it still was.
+def order_stop_once(s: Session, robot_id: int, by: str, why: str, at: float, stop_id: str) -> bool:
+    """Store an order to stop for a relay that runs, or for the next one that does.
 
-    :param at: Unix seconds, as it was ordered; ``None`` for whatever order there is
+    It counts up the revision, so that a running relay sends the order at once. Parameters and errors are those of
+    :func:`order_stop`.
+
+    :returns: false if the order is stored already: the relay has received it by another path
+    """
+    stored = pending_stop(s, robot_id)
+    if stored is not None and stop_id and (stored.by, stored.stop_id) == (by, stop_id):
+        return False
+    order_stop(s, robot_id, by, why, at, stop_id, announce=True)
+    return True
+
+
+def remove_stop(s: Session, robot_id: int, at: float | None = None) -> bool:
+    """Remove an order to stop; false if there was none.
+
+    :param at: only the order of this time, Unix seconds; ``None`` for any order
     """
     order = delete(StopOrder).where(StopOrder.robot_id == robot_id)
     if at is not None:
@@ -43,17 +71,19 @@ def stop_told(s: Session, robot_id: int, at: float | None = None) -> bool:
 
 
 def pending_stop(s: Session, robot_id: int) -> StopRecord | None:
-    """What the robot is still to be told."""
+    """The order that a robot has not confirmed yet."""
     return next(iter(_orders(s, robot_id)), None)
 
 
 def pending_stops(s: Session) -> list[StopRecord]:
-    """What robots are still to be told."""
+    """All orders that robots have not confirmed yet."""
     return _orders(s)
 
 
 def _orders(s: Session, robot_id: int | None = None) -> list[StopRecord]:
-    query = select(StopOrder.robot_id, StopOrder.by, StopOrder.why, StopOrder.at).order_by(StopOrder.robot_id)
+    query = select(StopOrder.robot_id, StopOrder.by, StopOrder.why, StopOrder.at, StopOrder.stop_id).order_by(
+        StopOrder.robot_id
+    )
     if robot_id is not None:
         query = query.where(StopOrder.robot_id == robot_id)
-    return [StopRecord(*row) for row in s.execute(query)]
+    return fetch_all(s, StopRecord, query)

@@ -1,5 +1,6 @@
-"""What either end may say: on every link, and on a channel link, where whoever offers a service or an action is
-called.
+"""Messages that both ends send: keepalive on every link, and service calls and goals on a channel link.
+
+A call or goal goes to the end that offers the service or action.
 """
 
 from __future__ import annotations
@@ -11,32 +12,39 @@ from relay_protocol.message import Body, Message
 
 
 class Ping(Message, frozen=True, kw_only=True):
-    """Either end: answer at once. ``t`` is the asker's monotonic clock in nanoseconds."""
+    """The receiver answers at once with ``pong``.
+
+    :param t: sender's monotonic clock, nanoseconds
+    """
 
     t: int
 
 
 class Pong(Message, frozen=True, kw_only=True):
-    """The answer: ``t`` as it came, ``at`` the answerer's monotonic clock in nanoseconds."""
+    """The answer to ``ping``.
+
+    :param t: as in the ping
+    :param at: answering end's monotonic clock, nanoseconds
+    """
 
     t: int
     at: int
 
 
 class Bye(Reasoned, frozen=True, kw_only=True):
-    """Either end: I am closing this link on purpose."""
+    """The sender closes this link on purpose."""
 
     reason: str
 
 
 class CallService(Message, frozen=True, kw_only=True):
-    """Call a service. Arguments are ``cdr`` (base64) or, for a robot without CDR, ``args``.
+    """Call a service. The request is in ``cdr`` (base64) or, for a robot without CDR, in ``args``.
 
     :param id: chosen by the caller; the answer carries it
-    :param timeout: seconds the caller waits for the answer; 0 when it did not say
-    :param source: from the relay, the connection that calls
-    :param stamp: from the relay, its monotonic nanoseconds before which the call can't have been sent; ``None`` when
-        it did not say
+    :param timeout: seconds the caller waits for the answer; 0 when not given
+    :param source: connection that calls; set by the relay
+    :param stamp: the call was sent after this time of the relay's monotonic clock, nanoseconds; set by the relay,
+        ``None`` when not known
     """
 
     id: Label
@@ -50,10 +58,11 @@ class CallService(Message, frozen=True, kw_only=True):
 
 
 class ServiceResponse(Reasoned, frozen=True, kw_only=True):
-    """The answer to ``call_service``; ``reason`` when ``result`` is false.
+    """The answer to ``call_service``.
 
-    ROS 2 has no way to tell a caller that a service failed: a robot that gets ``result`` false lets its caller
-    wait in vain.
+    A ROS 2 service cannot report an error: when ``result`` is false, the caller in the robot's graph gets no answer.
+
+    :param reason: why ``result`` is false
     """
 
     id: Label
@@ -64,11 +73,11 @@ class ServiceResponse(Reasoned, frozen=True, kw_only=True):
 
 
 class SendActionGoal(Message, frozen=True, kw_only=True):
-    """Pursue a goal. It is answered by exactly one ``action_result``, after any number of ``action_feedback``.
+    """Execute a goal. The answer is any number of ``action_feedback`` and exactly one ``action_result``.
 
-    :param id: chosen by the asker; everything about this goal carries it
-    :param feedback: whether the asker wants ``action_feedback``
-    :param source: from the relay, the connection whose goal it is
+    :param id: chosen by the sender; every message about this goal carries it
+    :param feedback: whether to send ``action_feedback``
+    :param source: connection that owns the goal; set by the relay
     :param stamp: as in :class:`CallService`
     """
 
@@ -83,13 +92,13 @@ class SendActionGoal(Message, frozen=True, kw_only=True):
 
 
 class CancelActionGoal(Message, frozen=True, kw_only=True):
-    """The asker wants the goal no more. Its ``action_result`` still comes, also when it ended otherwise."""
+    """Cancel a goal. Its ``action_result`` still comes, also when the goal ended otherwise."""
 
     id: Label
 
 
 class ActionFeedback(Message, frozen=True, kw_only=True):
-    """How far the goal has come, by the one who pursues it."""
+    """Feedback of the end that executes the goal."""
 
     id: Label
     cdr: str | None = None
@@ -97,10 +106,11 @@ class ActionFeedback(Message, frozen=True, kw_only=True):
 
 
 class ActionResult(Reasoned, frozen=True, kw_only=True):
-    """The goal is over.
+    """The goal has ended.
 
-    :param status: of ``action_msgs/msg/GoalStatus``: 4 succeeded, 5 canceled, 6 aborted; 0 when it never began
-    :param result: whether there is a result, in ``cdr`` or ``values``; else ``reason`` says why not
+    :param status: of ``action_msgs/msg/GoalStatus``: 4 succeeded, 5 canceled, 6 aborted; 0 when it never started
+    :param result: whether ``cdr`` or ``values`` holds a result
+    :param reason: why there is none
     """
 
     id: Label
@@ -111,7 +121,7 @@ class ActionResult(Reasoned, frozen=True, kw_only=True):
     reason: str = ""
 
 
-BothChannel = (
+CommonChannel = (
     CallService
     | ServiceResponse
     | SendActionGoal
@@ -122,3 +132,4 @@ BothChannel = (
     | Pong
     | Bye
 )
+"""What both ends may send on a channel link."""

@@ -1,4 +1,4 @@
-"""Fields of link messages: texts of bounded length, words for people, bytes."""
+"""Field types of link messages: texts and lists of bounded length, connection numbers, base64."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from relay_protocol.errors import Invalid
 from relay_protocol.message import Message
 
 Name = Annotated[str, Meta(max_length=limits.NAME)]
-Label = Annotated[str, Meta(max_length=limits.LABEL)]
-Ends = Annotated[list[Name], Meta(max_length=limits.GRAPH_ENDS)]
+Label = Annotated[str, Meta(max_length=limits.LABEL_LENGTH)]
+NodeList = Annotated[list[Name], Meta(max_length=limits.GRAPH_NODES)]
 Source = Annotated[int, Meta(ge=0, le=2**32 - 1)]
-"""A connection of a client, as the relay numbers them; 0 is nobody."""
+"""Number of a client connection, given by the relay; 0 for none."""
 
 Stamp = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-"""A moment of the relay's monotonic clock, nanoseconds, before which something can't have been sent."""
+"""Time of the relay's monotonic clock, nanoseconds, after which a message was sent."""
 
-Few = Annotated[list[Name], Meta(max_length=limits.FACTS)]
+NameList = Annotated[list[Name], Meta(max_length=limits.LIST_ITEMS)]
 
 
 def cut(message: msgspec.Struct, *fields: str) -> None:
-    """Words for people are cut, on either end: they are no reason to lose a link."""
+    """Shorten texts for display to ``limits.TEXT_LENGTH``, so that a long one does not end a link."""
     for field in fields:
         text = getattr(message, field)
-        if len(text) > limits.WORDS:
-            force_setattr(message, field, text[: limits.WORDS - 1] + "…")
+        if len(text) > limits.TEXT_LENGTH:
+            force_setattr(message, field, text[: limits.TEXT_LENGTH - 1] + "…")
 
 
 class Reasoned(Message, frozen=True, kw_only=True):
@@ -47,11 +47,12 @@ def to_base64(data: bytes) -> str:
 
 
 def from_base64(text: str, what: str) -> bytes:
-    """The bytes of a JSON field; ``what`` names it in the error.
+    """Bytes from a JSON field.
 
+    :param what: name of the field, for the error
     :raises Invalid: not base64
     """
     try:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
-        raise Invalid(f"{what} is not base64") from None
+        raise Invalid(f"{what} is not base64 (RFC 4648 section 4)") from None

@@ -1,4 +1,4 @@
-"""Cameras and the video link: what a robot can show, how the relay wants it, what goes over a link of its own."""
+"""Cameras and the video link (SPEC 2.6): the robot's cameras, the settings of a stream, and its messages."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from relay_protocol.link.common import Bye, Ping, Pong
 from relay_protocol.link.fields import Label, Name, Reasoned, cut
 from relay_protocol.message import Message
 
-Side = Annotated[int, Meta(ge=0, le=limits.PICTURE_SIDE)]
+Side = Annotated[int, Meta(ge=0, le=limits.IMAGE_SIDE)]
 
-Shown = Annotated[int, Meta(ge=1, le=limits.PICTURE_SIDE)]
+FrameSide = Annotated[int, Meta(ge=1, le=limits.IMAGE_SIDE)]
 Count = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Rate = Annotated[float, Meta(ge=0, le=1e6)]
 
@@ -22,35 +22,35 @@ Codec = Literal["jpeg", "png", "h264"]
 
 
 _COMPRESSED = "/compressed"
-"""What image_transport adds to the name of a topic for its compressed pictures."""
+"""Suffix of a topic of compressed images (ROS package image_transport)."""
 
 
 def raw_of(camera: str) -> str:
-    """The topic of a camera's raw pictures, by that or by the one of its compressed pictures."""
+    """The topic of a camera's raw images, from either of its topics."""
     return camera.removesuffix(_COMPRESSED)
 
 
 def compressed_of(camera: str) -> str:
-    """The topic of a camera's compressed pictures, by that or by the one of its raw pictures."""
+    """The topic of a camera's compressed images, from either of its topics."""
     return raw_of(camera) + _COMPRESSED
 
 
 class VideoSettings(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
-    """How a picture is wanted. Two viewers who want the same share one stream.
+    """Settings of a stream. Viewers with equal settings share one stream.
 
-    The edits are done in this order: crop, rotate, invert, scale, stamp.
+    Transforms are applied in this order: crop, rotate, invert, scale, stamp.
 
-    :param width: pixels; 0 follows from ``height`` and the picture's own proportions, or is the picture's own
+    :param width: pixels; 0 keeps the proportions by ``height``, or the camera's own width
     :param height: pixels; like ``width``
     :param quality: of JPEG, 1 to 100; H.264 derives its own from it
-    :param fps: most pictures per second; 0 for all there are
-    :param crop: x, y, width, height of the part to show, in pixels of the camera; all 0 for the whole
-    :param rotate: clockwise, degrees
-    :param invert: turned by 180 degrees (as web_video_server has it)
-    :param stamp: time burned in
-    :param codec: ``png`` is for single pictures
-    :param qos: profile of the subscription: ``""`` matches the publisher, else ``sensor_data`` or ``default``
-    :param transport: ``raw``, ``compressed``, or ``""`` for what the robot thinks best
+    :param fps: highest frame rate, Hz; 0 for all frames
+    :param crop: x, y, width, height in pixels of the camera; all 0 for the whole frame
+    :param rotate: degrees, clockwise
+    :param invert: turn by 180 degrees (as web_video_server does)
+    :param stamp: draw the time into the frame
+    :param codec: ``png`` is for single frames
+    :param qos: of the subscription: ``""`` matches the publisher, else ``sensor_data`` or ``default``
+    :param transport: ``raw``, ``compressed``, or ``""`` for the robot's choice
     """
 
     width: Side = 0
@@ -67,15 +67,15 @@ class VideoSettings(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
 
 
 class Camera(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Something that gives pictures. What is known only once it was looked at stays at its default till then.
+    """A camera. Fields of the last frame keep their defaults until a frame has been received.
 
     :param name: of its topic; a camera without ROS has a name of the same form
     :param type: of the topic; ``""`` for a camera without ROS
-    :param encoding: of the last picture: ``rgb8``, ``16UC1``, ``jpeg``, …
-    :param width: of the last picture, pixels
-    :param height: of the last picture, pixels
-    :param fps: pictures per second, as they came of late
-    :param seen: when they were like this, Unix time at the robot: its last picture by the time this was told
+    :param encoding: of the last frame: ``rgb8``, ``16UC1``, ``jpeg``, …
+    :param width: of the last frame, pixels
+    :param height: of the last frame, pixels
+    :param fps: frames per second, measured recently
+    :param seen: when the last frame was received, Unix time at the robot, seconds
     """
 
     name: Name
@@ -88,9 +88,9 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Cameras(Message, frozen=True, kw_only=True):
-    """Robot, control link: all cameras I have; after ``welcome`` and whenever they change.
+    """Robot, control link: all its cameras; after ``welcome`` and after every change.
 
-    :param streams: most I show at a time; 0 when I don't know
+    :param streams: most streams at a time; 0 when unknown
     """
 
     cameras: Annotated[list[Camera], Meta(max_length=limits.CAMERAS)] = msgspec.field(default_factory=list)
@@ -98,9 +98,9 @@ class Cameras(Message, frozen=True, kw_only=True):
 
 
 class OpenVideo(Message, frozen=True, kw_only=True):
-    """Relay, control link: dial, ``join`` with this ticket, and show this camera there.
+    """Relay, control link: dial, ``join`` with this ticket, and stream this camera there.
 
-    :param stream: name of the stream, which ``joined`` says again as ``channel``
+    :param stream: id of the stream; ``joined`` repeats it as ``channel``
     :param address: ``host:port`` to dial; empty for the address of the control link
     """
 
@@ -112,28 +112,29 @@ class OpenVideo(Message, frozen=True, kw_only=True):
 
 
 class CloseVideo(Message, frozen=True, kw_only=True):
-    """Relay, control link: nobody watches this stream any more."""
+    """Relay, control link: this stream has no viewers any more."""
 
     stream: Label
 
 
-class Playing(Message, frozen=True, kw_only=True):
-    """Robot, video link: what I send from now on, which is less than was asked for where the uplink is thin.
+class StreamStatus(Message, frozen=True, kw_only=True):
+    """Robot, video link: what is sent from now on, which is less than requested when the uplink is slow.
 
     :param width: pixels
     :param height: pixels
     :param quality: of JPEG
-    :param fps: pictures per second aimed at; 0 for all there are
-    :param reduced: how far it is below what was asked for: 0 as asked, 1 the least there is
-    :param delay_ms: from the picture's arrival at the robot's daemon to the relay's word that it is there
-    :param encoding: of the camera's own pictures
-    :param source_fps: pictures per second the camera gives
-    :param latched: its publisher keeps the latest picture for those who come later, however old it is
-    :param trouble: why no picture has come for a while though the camera gives some, in words; empty while all is well
+    :param fps: target frame rate, Hz; 0 for all frames
+    :param reduced: how far this is below the request: 0 as requested, 1 the lowest possible
+    :param delay_ms: milliseconds from the frame's arrival at the daemon to the relay's ``frame_ack``
+    :param encoding: of the camera's own frames
+    :param source_fps: frame rate of the camera, Hz
+    :param latched: the publisher keeps its latest frame for late subscribers, however old it is
+    :param problem: why no frame has been sent for a while although the camera delivers; empty when all is well
+    :param damaged: frames of the camera that could not be shown, since the link was opened
     """
 
-    width: Shown
-    height: Shown
+    width: FrameSide
+    height: FrameSide
     quality: Annotated[int, Meta(ge=0, le=100)]
     fps: Rate = 0.0
     reduced: Annotated[float, Meta(ge=0, le=1)] = 0.0
@@ -141,36 +142,36 @@ class Playing(Message, frozen=True, kw_only=True):
     encoding: Label = ""
     source_fps: Rate = 0.0
     latched: bool = False
-    trouble: str = ""
+    problem: str = ""
+    damaged: Annotated[int, Meta(ge=0)] = 0
 
     def __post_init__(self) -> None:
-        """Words are cut."""
-        cut(self, "trouble")
+        cut(self, "problem")
 
 
-class NotPlaying(Reasoned, frozen=True, kw_only=True):
-    """Robot, video link: this can't be shown, and the link ends.
+class StreamRefused(Reasoned, frozen=True, kw_only=True):
+    """Robot, video link: the stream is not possible, and the link ends.
 
-    :param busy: the robot encodes as many streams as it can; one that is there already can be shared
+    :param busy: the robot encodes as many streams as it can; an existing one may be shared
     """
 
     reason: str
     busy: bool = False
 
 
-class Took(Message, frozen=True, kw_only=True):
-    """Relay, video link: the picture of this number is here, or a part. The robot measures its uplink by it.
+class FrameAck(Message, frozen=True, kw_only=True):
+    """Relay, video link: this frame, or a part of it, has been received. The robot measures its uplink by it.
 
-    :param upto: bytes of a picture in parts that are here; ``None`` when all of it is
+    :param received: bytes of a frame in parts received so far; ``None`` for the whole frame
     """
 
     number: int
-    upto: int | None = None
+    received: int | None = None
 
 
-class KeyFrame(Message, frozen=True, kw_only=True):
-    """Relay, video link: somebody joined a stream of H.264; begin anew with a key frame."""
+class RequestKeyFrame(Message, frozen=True, kw_only=True):
+    """Relay, video link: send a key frame next, because a viewer joined a stream of H.264."""
 
 
-RobotVideo = Playing | NotPlaying | Ping | Pong | Bye
-RelayVideo = Took | KeyFrame | Ping | Pong | Bye
+RobotVideo = StreamStatus | StreamRefused | Ping | Pong | Bye
+RelayVideo = FrameAck | RequestKeyFrame | Ping | Pong | Bye

@@ -1,11 +1,10 @@
-"""Python source made for one type, and what bounds it.
+"""Builds Python functions for single types, for :mod:`generated_cdr_to_json` and :mod:`generated_json_to_cdr`.
 
-Definitions come from robots and are not to be trusted. Of their text only names of fields get into a source,
-after they were checked, as string constants written by :func:`repr`; everything else (defaults, keys, formats) is
-handed over as an object under a name made here. The size of a source is bounded.
+Definitions come from robots and are not trusted. Only field names get into the source text; they are checked and
+written by :func:`repr`. Defaults, keys and formats are passed as objects. The size of the source is bounded.
 
-Generated code is for messages that are as they should be. For all others it raises one of :data:`SURPRISES`,
-and the closures, which know every case and can tell what was wrong, take the message instead.
+Generated code converts well-formed messages. For all others it raises one of :data:`SLOW_PATH_ERRORS`. The slow path
+(:mod:`reader`, :mod:`writer`) then converts the message, or says what is wrong with it.
 """
 
 from __future__ import annotations
@@ -20,51 +19,51 @@ from typing import Any
 import msgspec
 
 MAX_STEPS = 400
-"""Most values a generated function handles one by one; larger types stay with the closures."""
+"""Most values that a generated function converts one by one; larger types use the slow path only."""
 
 MAX_LOOPS = 8
-"""Deepest nesting of loops; Python itself takes 20, and 8 keep JSON within the depth that is allowed."""
+"""Deepest nesting of loops. Python allows 20; 8 keep JSON within its permitted depth."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,254}")
 
 
 class TooLarge(Exception):
-    """A type for which no code is generated."""
+    """The type is too large to generate code for."""
 
 
-class Unusual(ValueError):
-    """A message that generated code leaves to the closures."""
+class UseSlowPath(ValueError):
+    """Raised by generated code for a message that the slow path must convert."""
 
 
-SURPRISES = (struct.error, IndexError, ValueError, TypeError, OverflowError, msgspec.MsgspecError)
-"""All that a message which is not as it should be can raise in generated code."""
+SLOW_PATH_ERRORS = (struct.error, IndexError, ValueError, TypeError, OverflowError, msgspec.MsgspecError)
+"""Everything generated code can raise for an unusual or invalid message."""
 
 
-class Source:
-    """Lines of one function, and the objects they refer to."""
+class FunctionBuilder:
+    """Collects the lines of one function and the objects they use."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
         self._depth = 2
         self._loops = 0
         self._steps = 0
-        self._made = 0
+        self._variables = 0
         self._objects: dict[str, Any] = {
-            "SURPRISES": SURPRISES,
-            "Unusual": Unusual,
+            "SLOW_PATH_ERRORS": SLOW_PATH_ERRORS,
+            "UseSlowPath": UseSlowPath,
         }
 
     def line(self, text: str) -> None:
-        """One more statement."""
+        """Append a statement."""
         self._lines.append("    " * self._depth + text)
 
-    def first(self, text: str) -> None:
-        """A statement before all others."""
+    def prepend(self, text: str) -> None:
+        """Insert a statement before all others."""
         self._lines.insert(0, "        " + text)
 
     @contextmanager
     def block(self, head: str) -> Iterator[None]:
-        """Statements inside ``head``, a loop or a condition."""
+        """Statements added inside are indented below ``head``, a loop or a condition."""
         self._loops += 1
         if self._loops > MAX_LOOPS:
             raise TooLarge
@@ -74,40 +73,41 @@ class Source:
         self._depth -= 1
         self._loops -= 1
 
-    def step(self) -> None:
-        """Count one value.
+    def count_value(self) -> None:
+        """Count one converted value.
 
-        :raises TooLarge: it was one too many
+        :raises TooLarge: more than :data:`MAX_STEPS`
         """
         self._steps += 1
         if self._steps > MAX_STEPS:
             raise TooLarge
 
-    def fresh(self) -> str:
-        """A local name that no other value has."""
-        self._made += 1
-        return f"v{self._made}"
+    def new_variable(self) -> str:
+        """A new local name."""
+        self._variables += 1
+        return f"v{self._variables}"
 
     def constant(self, value: Any) -> str:
-        """A name for an object the code uses."""
+        """A global name for an object the code uses."""
         name = f"K{len(self._objects)}"
         self._objects[name] = value
         return name
 
-    def function(self, arguments: str) -> Callable[[Callable[..., bytes]], Callable[..., bytes]]:
-        """The function whose body the lines are.
+    def function(self, *parameters: str) -> Callable[[Callable[..., bytes]], Callable[..., bytes]]:
+        """Compile the function.
 
-        :returns: what takes the function for messages that raise any of :data:`SURPRISES`, with the same
-            arguments, and gives the whole
+        :param parameters: names, with default values if they have some: ``now=0``
+        :returns: takes the slow path, a function with the same arguments, and returns the complete function
         """
+        names = ", ".join(each.partition("=")[0] for each in parameters)
         text = "\n".join(
             [
-                f"def convert({arguments}):",
+                f"def convert({', '.join(parameters)}):",
                 "    try:",
                 *self._lines,
-                "    except SURPRISES:",
+                "    except SLOW_PATH_ERRORS:",
                 "        pass",
-                f"    return slow({arguments})",
+                f"    return slow({names})",
             ]
         )
         code = compile(text, "<generated>", "exec")
@@ -122,51 +122,51 @@ class Source:
 
 
 def quoted(name: str) -> str:
-    """A field's name as a string constant, checked once more.
+    """A field name as a string constant, checked once more.
 
-    :raises TooLarge: it is no plain identifier, so no code is generated with it
+    :raises TooLarge: not a plain identifier; no code is generated then
     """
     if not _NAME.fullmatch(name):
         raise TooLarge
     return repr(name)
 
 
-class Cursor(ABC):
-    """How far generated code has got in a message, and the numbers that are taken in one go.
+class CodeGenerator(ABC):
+    """Tracks the position in the message while code is generated, and joins neighbouring numbers into one format.
 
-    CDR aligns to multiples of 2, 4 and 8 from the start of the body. Of the place in the body this knows the
-    remainder ``rest`` when divided by ``known``: 8 up to the first text or sequence, 1 right behind a text.
+    CDR aligns to multiples of 2, 4 and 8 from the start of the body. The position is known as ``remainder`` modulo
+    ``alignment``: 8 up to the first text or sequence, 1 right after a text.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: FunctionBuilder) -> None:
         self.source = source
-        self.known = 8
-        self.rest = 0
+        self.alignment = 8
+        self.remainder = 0
         self.codes: list[str] = []
         self.slots: list[str] = []
 
     def add(self, code: str, size: int, alignment: int, *slots: str) -> None:
-        """Numbers (as :mod:`struct` writes them) that stand next."""
+        """Append numbers in a format of :mod:`struct`."""
         self.align(alignment)
         self.codes.append(code)
         self.slots.extend(slots)
-        self.rest = (self.rest + size) % self.known
+        self.remainder = (self.remainder + size) % self.alignment
 
     def align(self, alignment: int) -> None:
-        """Pass over what fills up to a multiple of this."""
-        if alignment > self.known:
-            self.jump(alignment)
-            self.known, self.rest = alignment, 0
-        elif padding := -self.rest % alignment:
+        """Skip padding up to a multiple of this."""
+        if alignment > self.alignment:
+            self.emit_alignment(alignment)
+            self.alignment, self.remainder = alignment, 0
+        elif padding := -self.remainder % alignment:
             self.codes.append(f"{padding}x")
-            self.rest = (self.rest + padding) % self.known
+            self.remainder = (self.remainder + padding) % self.alignment
 
-    def lost(self, known: int) -> None:
-        """From here on the place is only known as a multiple of this."""
-        self.known, self.rest = known, 0
+    def set_alignment(self, alignment: int) -> None:
+        """From here on the position is only known as a multiple of this."""
+        self.alignment, self.remainder = alignment, 0
 
-    def take(self) -> tuple[struct.Struct, list[str]] | None:
-        """The numbers that wait, as one format with their slots; ``None`` when there are none."""
+    def take_format(self) -> tuple[struct.Struct, list[str]] | None:
+        """The pending numbers as one format with their variables; ``None`` when there are none."""
         if not self.codes:
             return None
         found = struct.Struct("<" + "".join(self.codes)), self.slots
@@ -174,5 +174,5 @@ class Cursor(ABC):
         return found
 
     @abstractmethod
-    def jump(self, alignment: int) -> None:
-        """Emit what aligns at run time."""
+    def emit_alignment(self, alignment: int) -> None:
+        """Emit code that aligns at run time."""

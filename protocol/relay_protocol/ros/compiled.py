@@ -1,33 +1,43 @@
-"""All types of one text with what converts their messages, built when first needed and then kept."""
+"""The types of one definition text with their readers and writers, created on first use."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, cast
 
 import cbor2
 import msgspec
 import orjson
 
-from relay_protocol import json_cost, jsontext
+from relay_protocol import json_cost, jsontext, nonfinite
 from relay_protocol.errors import Invalid, MalformedMessage
-from relay_protocol.ros import fast_reader, fast_writer
-from relay_protocol.ros.definition import Definition, parse
-from relay_protocol.ros.fast_writer import LARGEST_BODY
-from relay_protocol.ros.reader import HEAD, ReaderFactory
-from relay_protocol.ros.writer import Mismatch, WriterFactory, as_invalid
+from relay_protocol.ros import generated_cdr_to_json, generated_json_to_cdr
+from relay_protocol.ros.cdr_to_json import HEADER_BYTES, ReaderFactory
+from relay_protocol.ros.definition import HEADER, Definition, parse
+from relay_protocol.ros.generated_json_to_cdr import LARGEST_BODY, Check
+from relay_protocol.ros.json_to_cdr import Mismatch, WriterFactory, as_invalid
 
 Reader = Callable[[bytes], bytes]
-"""Takes CDR with its header; gives the message in JSON or CBOR. Raises :class:`Invalid`."""
+"""Takes CDR with its header; returns JSON or CBOR. Raises :class:`Invalid`."""
 
-Writer = Callable[[Any, int], bytes]
-"""Takes JSON (text as bytes, or decoded) and the present time (ns since 1970); gives CDR with its header.
-Raises :class:`Invalid`."""
+
+class Writer(Protocol):
+    """Converts JSON to CDR."""
+
+    def __call__(self, body: Any, now_ns: int = 0, /) -> bytes:
+        """Convert one message.
+
+        :param body: JSON text, or the decoded value
+        :param now_ns: the current time, ns since 1970, for stamps that are left out
+        :returns: with its header
+        :raises Invalid: it is not of the type
+        """
+
 
 _ORDERS = {b"\x00\x01": "<", b"\x00\x00": ">"}
 """Byte order of the numbers by the first two bytes of a message."""
 
-_WRITTEN_HEAD = b"\x00\x01\x00\x00"
+_ENCAPSULATION_HEADER = b"\x00\x01\x00\x00"
 
 
 def _json(value: Any) -> bytes:
@@ -38,8 +48,8 @@ _ENCODERS: dict[str, Callable[[Any], bytes]] = {"json": _json, "cbor": cbor2.dum
 _ANY: msgspec.json.Decoder[Any] = msgspec.json.Decoder()
 
 
-class Compiled:
-    """The types of one text. Each way has a fast part for what is usual and closures for all else.
+class CompiledTypes:
+    """The types of one text. Each conversion has generated code for usual messages and a slow path for all others.
 
     :raises Invalid: see :func:`relay_protocol.ros.definition.parse`
     """
@@ -52,13 +62,14 @@ class Compiled:
         self._slow_readers: dict[tuple[str, str], ReaderFactory] = {}
         self._readers: dict[tuple[str, str], Reader] = {}
         self._writers: dict[str, tuple[Writer, Writer]] = {}
+        self._checks: dict[str, Check] = {}
 
     def reader(self, name: str, form: str) -> Reader:
-        """What turns a message of this type into ``form``, ``json`` or ``cbor``."""
+        """The reader of a message type for ``json`` or ``cbor``."""
         found = self._readers.get((name, form))
         if found is None:
             slow = self._slow_reader(name, form)
-            found = fast_reader.generate(name, self.definitions, form, slow)
+            found = generated_cdr_to_json.generate(name, self.definitions, form, slow)
             self._readers[name, form] = found
         return found
 
@@ -66,8 +77,8 @@ class Compiled:
         encode = _ENCODERS[form]
 
         def read(cdr: bytes) -> bytes:
-            if len(cdr) < HEAD:
-                raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
+            if len(cdr) < HEADER_BYTES:
+                raise Invalid(f"{name}: {len(cdr)} bytes are too few for a CDR message")
             try:
                 return encode(self._factory(cdr[:2], form).read(name, cdr))
             except Invalid as error:
@@ -85,16 +96,34 @@ class Compiled:
         return found
 
     def writer(self, name: str, checked: bool) -> Writer:
-        """What turns JSON into a message of this type; ``checked`` text is not checked again."""
+        """The writer of a message type; ``checked`` text is not checked again."""
         found = self._writers.get(name)
         if found is None:
-            made = fast_writer.generate(name, self.definitions)
+            made = generated_json_to_cdr.generate(name, self.definitions)
             strict, trusting = self._slow_writer(name, jsontext.decode_any), self._slow_writer(name, _decode)
-            found = self._writers[name] = (made(strict), made(trusting))
+            found = self._writers[name] = (cast(Writer, made(strict)), cast(Writer, made(trusting)))
         return found[checked]
 
+    def check(self, name: str) -> Check:
+        """The check of a text for robots that speak JSON; it takes what :meth:`writer` takes."""
+        found = self._checks.get(name)
+        if found is None:
+            write = self.writer(name, checked=True)
+
+            def check_by_writing(body: bytes) -> bytes:
+                write(body)
+                return json_for_robot(body)
+
+            made = generated_json_to_cdr.generate_check(name, self.definitions)
+            found = self._checks[name] = made(check_by_writing) if made else check_by_writing
+        return found
+
+    def is_stamped(self, name: str) -> bool:
+        """Whether :meth:`writer` may need the present time: the type is a header, or has one somewhere."""
+        return HEADER in _contained(name, self.definitions)
+
     def _slow_writer(self, name: str, decode: Callable[[bytes], Any]) -> Writer:
-        def write(body: Any, now_ns: int) -> bytes:
+        def write(body: Any, now_ns: int = 0, /) -> bytes:
             if type(body) is bytes:
                 json_cost.check_odd(body)
             try:
@@ -110,9 +139,34 @@ class Compiled:
                 raise Invalid(
                     f"{name}: the message has {len(out)} bytes; a robot takes at most {LARGEST_BODY}"
                 )
-            return _WRITTEN_HEAD + out
+            return _ENCAPSULATION_HEADER + out
 
         return write
+
+
+def json_for_robot(body: bytes) -> bytes:
+    """A text that was checked, as robots that speak JSON get it.
+
+    So numbers keep all their digits, and omitted fields stay omitted.
+
+    :raises Invalid: it is too large
+    """
+    body = nonfinite.marks_to_null(body)
+    if len(body) > LARGEST_BODY:
+        raise Invalid(f"the message has {len(body)} bytes as JSON; a robot takes at most {LARGEST_BODY}")
+    return body
+
+
+def _contained(name: str, definitions: dict[str, Definition]) -> set[str]:
+    """Names of a type and all types in it."""
+    found: set[str] = set()
+    left = [name]
+    while left:
+        name = left.pop()
+        if name in definitions and name not in found:
+            found.add(name)
+            left += [field.type.base for field in definitions[name].fields]
+    return found
 
 
 def _decode(text: bytes) -> Any:

@@ -1,8 +1,7 @@
 """ROS 2 interface definitions, parsed from the text a robot sends.
 
-The text is a stranger's: it is read line by line with patterns that can't backtrack, and everything that
-decides how much memory or time a message costs (nesting, fixed lengths, number of fields) is bounded here,
-before anything is built from it.
+The text is not trusted. It is read line by line with patterns that cannot backtrack. Nesting, fixed lengths and the
+number of fields, which decide the memory and time of a message, are bounded here before anything is built from it.
 
 Source: the ROS 2 interface definition format (design.ros2.org, "Interface definition using .msg / .srv /
 .action files"), in rosbag2's ``ros2msg`` layout.
@@ -17,7 +16,7 @@ from collections.abc import Container
 from typing import Any, NamedTuple
 
 from relay_protocol.errors import Invalid
-from relay_protocol.limits import COMMAND_FRAME, NAME, TYPE_DEFINITION
+from relay_protocol.limits import NAME, RELAY_JSON_FRAME, TYPE_DEFINITION
 
 MAX_NESTING = 32
 """Deepest nesting of messages in messages."""
@@ -34,8 +33,8 @@ class Primitive(NamedTuple):
 
     :param code: its letter in :mod:`struct`; empty for strings
     :param size: bytes on the wire, which is its alignment too
-    :param idl: its name in IDL, which is what rosapi shows
-    :param zero: the value it has when nobody sets it
+    :param idl: its name in IDL, which rosapi shows
+    :param zero: its default value
     """
 
     code: str
@@ -93,7 +92,7 @@ class FieldType(NamedTuple):
 
 
 class Field(NamedTuple):
-    """One field; ``default`` is ``None`` where the text gives none."""
+    """One field; ``default`` is ``None`` when the text has none."""
 
     name: str
     type: FieldType
@@ -101,7 +100,7 @@ class Field(NamedTuple):
 
 
 class Constant(NamedTuple):
-    """A named value of a definition; nothing of it is on the wire."""
+    """A constant of a definition; it is not sent."""
 
     name: str
     type: FieldType
@@ -118,14 +117,14 @@ class Definition(NamedTuple):
 
 _PARTS = {"msg": ("",), "srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
 _SERVICES = ("_SendGoal", "_GetResult")
-"""Services that an action is made of (design.ros2.org, actions)."""
+"""Services of an action (design.ros2.org, actions)."""
 _DERIVED = {
     "srv": re.compile(r"(.+?)_(?:Request|Response|Event)\Z"),
     "action": re.compile(
         r"(.+?)_(?:Goal|Result|Feedback|FeedbackMessage|(?:SendGoal|GetResult)(?:_(?:Request|Response|Event))?)\Z"
     ),
 }
-"""Names of what ROS makes of a service or an action, by its kind."""
+"""Names of the types that rosidl derives from a service or an action."""
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(?:(?:msg|srv|action)/)?[A-Za-z][A-Za-z0-9_]*\Z")
 _SEPARATOR = re.compile(r"={80,}[ \t\r]*\Z")
 _LINE = re.compile(
@@ -158,13 +157,13 @@ def normalise(type_name: str) -> str:
     :raises Invalid: no type name
     """
     if len(type_name) > NAME or not _TYPE_NAME.match(type_name):
-        raise Invalid(f"{_quote(type_name)} is no type name; write package/msg/Name or package/srv/Name")
+        raise Invalid(f"{_quote(type_name)} is not a type name; write package/msg/Name or package/srv/Name")
     package, *kind, name = type_name.split("/")
     return f"{package}/{kind[0] if kind else 'msg'}/{name}"
 
 
 def parts_of(type_name: str) -> tuple[str, ...]:
-    """Names of the messages that a type consists of: itself, or the parts of a service or action."""
+    """The message types of a type: itself, or the parts of a service or action."""
     kind = type_name.split("/")[1]
     if source_of(type_name) != type_name:
         kind = "srv" if type_name.endswith(_SERVICES) else "msg"
@@ -174,8 +173,8 @@ def parts_of(type_name: str) -> tuple[str, ...]:
 def source_of(type_name: str) -> str:
     """The type whose text defines a type: of ``pkg/action/Name_FeedbackMessage`` it is ``pkg/action/Name``.
 
-    ROS makes further messages and services of each service and action, which have no text of their own. No other type
-    has a name with an underscore (rosidl).
+    rosidl derives further messages and services from each service and action, without a text of their own. No other
+    type has an underscore in its name.
 
     :param type_name: a normalised name
     """
@@ -185,7 +184,7 @@ def source_of(type_name: str) -> str:
 
 
 def _derived(type_name: str) -> dict[str, str]:
-    """Texts of the messages that ROS makes of a service or an action beside its parts, and of what they contain."""
+    """Texts of the messages that rosidl derives from a service or an action, and of the types they contain."""
     kind = type_name.split("/")[1]
     if kind == "msg":
         return {}
@@ -208,11 +207,11 @@ def _derived(type_name: str) -> dict[str, str]:
 
 
 def parse(type_name: str, text: str) -> dict[str, Definition]:
-    """Read a definition with all it contains; the parts of ``type_name`` come first.
+    """Parse a definition with all types it contains; the parts of ``type_name`` come first.
 
     :param type_name: a normalised name
-    :param text: see :class:`relay_protocol.link.answers.TypeDefinition`
-    :raises Invalid: the text is no definition, is not complete, or makes messages beyond the limits
+    :param text: see :class:`relay_protocol.link.channel.TypeDefinition`
+    :raises Invalid: not a definition, incomplete, or beyond the limits
     """
     if len(text) > TYPE_DEFINITION:
         raise Invalid(f"{type_name}: the definition has more than {TYPE_DEFINITION} characters")
@@ -225,7 +224,7 @@ def parse(type_name: str, text: str) -> dict[str, Definition]:
 
 
 def _with_derived(type_name: str, definitions: dict[str, Definition]) -> dict[str, Definition]:
-    """The same with the messages that ROS makes of the type; without them, if they are beyond the limits."""
+    """Add the messages that rosidl derives from the type, unless they are beyond the limits."""
     bodies = {name: body.split("\n") for name, body in _derived(type_name).items()}
     known = {**bodies, **definitions}
     whole = {**{name: _parse_one(name, body, known) for name, body in bodies.items()}, **definitions}
@@ -295,7 +294,7 @@ def _split_parts(lines: list[str], wanted: int) -> list[list[str]]:
         else:
             parts[-1].append(line)
     if len(parts) != wanted:
-        raise Invalid(f"{len(parts)} parts divided by '---' where {wanted} are wanted")
+        raise Invalid(f"{len(parts)} parts divided by '---', expected {wanted}")
     return parts
 
 
@@ -308,7 +307,7 @@ def _parse_one(name: str, lines: list[str], known: Container[str]) -> Definition
             continue
         match = _LINE.match(line)
         if match is None:
-            raise Invalid(f"{_quote(line)} is no field")
+            raise Invalid(f"{_quote(line)} is not a field")
         kind = _field_type(match, name.split("/")[0], known)
         label, rest = match["name"], match["rest"].lstrip()
         if label in fields or label in constants:
@@ -360,7 +359,7 @@ def _literal(kind: FieldType, text: str, label: str) -> Any:
             return _scalar(kind, primitive, text)
         values = [_scalar(kind, primitive, item) for item in _items(text)]
     except (ValueError, OverflowError, struct.error):
-        raise Invalid(f"{_quote(text.strip())} is no value for '{label}', which is {kind.base}") from None
+        raise Invalid(f"{_quote(text.strip())} is not a value for '{label}', which is {kind.base}") from None
     if (kind.shape is Shape.ARRAY and len(values) != kind.length) or (
         kind.length and len(values) > kind.length
     ):
@@ -414,7 +413,7 @@ def _items(text: str) -> list[str]:
 
 
 class _Cost(NamedTuple):
-    """What one message costs when all its sequences are empty: single values, bytes, levels of nesting."""
+    """Size of a message when all its sequences are empty: values, bytes, levels of nesting."""
 
     parts: int
     size: int
@@ -422,7 +421,7 @@ class _Cost(NamedTuple):
 
 
 def _check_size(definitions: dict[str, Definition]) -> None:
-    """Refuse cycles, missing types, deep nesting, and messages that are huge even when empty."""
+    """Reject cycles, missing types, deep nesting, and messages that are huge even when empty."""
     costs: dict[str, _Cost] = {}
     for name in definitions:
         _cost(name, definitions, costs, ())
@@ -454,7 +453,7 @@ def _cost(
             parts, size = parts + (1 if packed else one.parts * kind.length), size + one.size * kind.length
         else:
             parts, size = parts + one.parts, size + one.size
-        if parts > MAX_PARTS or size > COMMAND_FRAME:
+        if parts > MAX_PARTS or size > RELAY_JSON_FRAME:
             raise Invalid(f"{name} is too large even when its sequences are empty")
     costs[name] = _Cost(parts, size, depth)
     return costs[name]

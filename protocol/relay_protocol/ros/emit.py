@@ -1,7 +1,7 @@
-"""What generated code writes: JSON by way of Python values, or CBOR byte by byte.
+"""Output of generated readers: JSON from Python values, or CBOR byte by byte.
 
-Source: RFC 8949 (CBOR), RFC 8746 (typed arrays). Heads have fixed widths here, so that one call packs many
-numbers with all that stands between them.
+Source: RFC 8949 (CBOR), RFC 8746 (typed arrays). Heads have fixed widths, so that one call packs many numbers and the
+bytes between them.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import orjson
 import pybase64
 
 from relay_protocol import jsontext
-from relay_protocol.ros.codegen import Source, quoted
+from relay_protocol.ros.cdr_to_json import TYPED_ARRAYS
+from relay_protocol.ros.codegen import FunctionBuilder, quoted
 from relay_protocol.ros.definition import BYTES, Definition, FieldType, Primitive
-from relay_protocol.ros.reader import TYPED_ARRAYS
-from relay_protocol.ros.structs import Structs
+from relay_protocol.ros.structs import StructFactory
 
 _FEW = 24
-"""Up to so many numbers :mod:`struct` is faster than numpy."""
+"""Up to this many numbers :mod:`struct` is faster than numpy."""
 
 _COPIED = 4096
-"""Up to so many bytes a copy is cheaper than a view."""
+"""Up to this many bytes a copy is faster than a view."""
 
 _UNPACK = {
     code: tuple(struct.Struct(f"<{count}{code}").unpack_from for count in range(_FEW + 1))
@@ -32,10 +32,10 @@ _UNPACK = {
 }
 
 
-class JsonForm:
-    """Values are expressions; one dict display is built of them and encoded by orjson."""
+class JsonEmitter:
+    """Values are expressions; together they are one dict display, which orjson encodes."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: FunctionBuilder) -> None:
         self._source = source
         self._arrays = False
 
@@ -44,11 +44,11 @@ class JsonForm:
         return name
 
     def text(self, name: str) -> str:
-        """Decoded; what is no UTF-8 raises."""
+        """Decoded; invalid UTF-8 raises."""
         self._source.line(f"{name} = {name}.decode()")
         return name
 
-    def wide(self, name: str) -> str:
+    def wide_text(self, name: str) -> str:
         """The variable."""
         return name
 
@@ -65,12 +65,12 @@ class JsonForm:
         return self._array(code, name)
 
     def numbers(self, kind: FieldType, count: str) -> str:
-        """The same, of any number."""
+        """As :meth:`fixed`, of any length."""
         assert kind.primitive is not None
-        name, code, size = self._source.fresh(), kind.primitive.code, kind.primitive.size
+        name, code, size = self._source.new_variable(), kind.primitive.code, kind.primitive.size
         length = count if size == 1 else f"{count} * {size}"
         part = f"data[p:p + {length}]"
-        self._source.line(f"if p + {length} > len(data): raise Unusual")
+        self._source.line(f"if p + {length} > len(data): raise UseSlowPath")
         if kind.base in BYTES:
             view = self._source.constant(memoryview)
             value = f"{self._base64()}({part} if {count} < {_COPIED} else {view}(data)[p:p + {length}])"
@@ -107,7 +107,7 @@ class JsonForm:
 
     def each(self, value: str, loop: str, count: str) -> str:
         """A list comprehension."""
-        name = self._source.fresh()
+        name = self._source.new_variable()
         self._source.line(f"{name} = [{value} {loop}]")
         return name
 
@@ -129,18 +129,18 @@ class JsonForm:
 
 
 class HoldsArrays(Exception):
-    """A message with arrays of numbers, which msgspec does not write."""
+    """The message has arrays of numbers, which msgspec cannot encode."""
 
 
-class PlainJsonForm(JsonForm):
-    """Values are expressions, messages are msgspec's structs: cheaper to make than dicts."""
+class StructJsonEmitter(JsonEmitter):
+    """Values are expressions, messages are msgspec structs, which are faster to create than dicts."""
 
-    def __init__(self, source: Source, structs: Structs) -> None:
+    def __init__(self, source: FunctionBuilder, structs: StructFactory) -> None:
         super().__init__(source)
         self._structs = structs
 
     def numbers(self, kind: FieldType, count: str) -> str:
-        """Not here.
+        """Not supported.
 
         :raises HoldsArrays: always
         """
@@ -159,8 +159,8 @@ class PlainJsonForm(JsonForm):
         raise HoldsArrays
 
 
-class Piece(NamedTuple):
-    """Some bytes of CBOR: known ones, packed numbers, or an expression.
+class CborPart(NamedTuple):
+    """Part of a CBOR item: constant bytes, packed numbers, or an expression.
 
     :param code: format of the numbers, big endian; empty for an expression
     :param values: expressions of the numbers, or the one expression; bytes where they are known
@@ -170,8 +170,8 @@ class Piece(NamedTuple):
     values: tuple[str | bytes, ...]
 
 
-def _known(data: bytes) -> Piece:
-    return Piece(f"{len(data)}s", (data,))
+def _known(data: bytes) -> CborPart:
+    return CborPart(f"{len(data)}s", (data,))
 
 
 def head(major: int, value: int) -> bytes:
@@ -192,59 +192,59 @@ _TEXT, _BYTES, _ARRAY = 0x7A, 0x5A, 0x9A
 """Heads of a text, bytes, and an array whose 32-bit length follows."""
 
 
-class CborForm:
-    """Values are lists of pieces; neighbouring ones are packed by one call."""
+class CborEmitter:
+    """Values are lists of parts; one call packs neighbouring ones."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: FunctionBuilder) -> None:
         self._source = source
 
-    def number(self, primitive: Primitive, name: str) -> list[Piece]:
+    def number(self, primitive: Primitive, name: str) -> list[CborPart]:
         """Head and number, both packed."""
         code = primitive.code
         if code == "?":
-            return [Piece("B", (f"0xf4 + {name}",))]
+            return [CborPart("B", (f"0xf4 + {name}",))]
         if code in _FLOATS:
-            return [_known(bytes([_FLOATS[code]])), Piece(code, (name,))]
+            return [_known(bytes([_FLOATS[code]])), CborPart(code, (name,))]
         if code in _UNSIGNED:
-            return [_known(bytes([_UNSIGNED[code]])), Piece(code, (name,))]
+            return [_known(bytes([_UNSIGNED[code]])), CborPart(code, (name,))]
         # A negative number n is written as -1 - n under the next major type.
         width, sign, unsigned = _INTEGERS[code]
-        return [Piece("B" + unsigned, (f"{width} | {name} >> {sign} & 32", f"{name} ^ {name} >> {sign}"))]
+        return [CborPart("B" + unsigned, (f"{width} | {name} >> {sign} & 32", f"{name} ^ {name} >> {sign}"))]
 
-    def text(self, name: str) -> list[Piece]:
-        """Copied; what is no UTF-8 raises."""
+    def text(self, name: str) -> list[CborPart]:
+        """Copied; invalid UTF-8 raises."""
         self._source.line(f"{name}.decode()")
         return self._sized(_TEXT, name)
 
-    def wide(self, name: str) -> list[Piece]:
-        """Encoded anew."""
+    def wide_text(self, name: str) -> list[CborPart]:
+        """Encoded as UTF-8."""
         self._source.line(f"{name} = {name}.encode()")
         return self._sized(_TEXT, name)
 
-    def fixed(self, kind: FieldType, name: str) -> list[Piece]:
+    def fixed(self, kind: FieldType, name: str) -> list[CborPart]:
         """A typed array, its bytes copied."""
         assert kind.primitive is not None
         if kind.primitive.code == "?":
             translated = f"{name}.translate({self._source.constant(_BOOLEANS)})"
-            return [_known(head(4, kind.length)), Piece(f"{kind.length}s", (translated,))]
+            return [_known(head(4, kind.length)), CborPart(f"{kind.length}s", (translated,))]
         size = kind.length * kind.primitive.size
         start = head(6, TYPED_ARRAYS[kind.primitive.code]) + head(2, size)
-        return [_known(start), Piece(f"{size}s", (name,))]
+        return [_known(start), CborPart(f"{size}s", (name,))]
 
-    def numbers(self, kind: FieldType, count: str) -> list[Piece]:
-        """The same, of any length."""
+    def numbers(self, kind: FieldType, count: str) -> list[CborPart]:
+        """As :meth:`fixed`, of any length."""
         assert kind.primitive is not None
-        name, code, size = self._source.fresh(), kind.primitive.code, kind.primitive.size
+        name, code, size = self._source.new_variable(), kind.primitive.code, kind.primitive.size
         length = count if size == 1 else f"{count} * {size}"
-        self._source.line(f"if p + {length} > len(data): raise Unusual")
+        self._source.line(f"if p + {length} > len(data): raise UseSlowPath")
         self._source.line(f"{name} = data[p:p + {length}]")
         if code == "?":
             translated = f"{name}.translate({self._source.constant(_BOOLEANS)})"
-            return [Piece("BI", (str(_ARRAY), count)), Piece("", (translated,))]
+            return [CborPart("BI", (str(_ARRAY), count)), CborPart("", (translated,))]
         return [_known(head(6, TYPED_ARRAYS[code])), *self._sized(_BYTES, name)]
 
-    def object(self, definition: Definition, values: Sequence[list[Piece]]) -> list[Piece]:
-        """A map, its keys in between."""
+    def object(self, definition: Definition, values: Sequence[list[CborPart]]) -> list[CborPart]:
+        """A map with its keys."""
         names = [field.name for field in definition.fields]
         pieces = [_known(head(5, len(names)))]
         for name, value in zip(names, values, strict=True):
@@ -252,42 +252,42 @@ class CborForm:
             pieces += [_known(head(3, len(key)) + key), *value]
         return pieces
 
-    def array(self, values: Sequence[list[Piece]]) -> list[Piece]:
-        """Elements behind their number."""
+    def array(self, values: Sequence[list[CborPart]]) -> list[CborPart]:
+        """The elements after their number."""
         return [_known(head(4, len(values))), *(piece for value in values for piece in value)]
 
-    def gathered(self, name: str, count: str) -> list[Piece]:
-        """What was gathered, behind the number of elements."""
-        return [Piece("BI", (str(_ARRAY), count)), Piece("", ("*" + name,))]
+    def gathered(self, name: str, count: str) -> list[CborPart]:
+        """The collected elements after their number."""
+        return [CborPart("BI", (str(_ARRAY), count)), CborPart("", ("*" + name,))]
 
-    def gather(self, name: str, value: list[Piece]) -> str:
+    def gather(self, name: str, value: list[CborPart]) -> str:
         """Append the element's parts."""
         return f"{name} += {self._parts(value)}"
 
-    def each(self, value: list[Piece], loop: str, count: str) -> list[Piece]:
+    def each(self, value: list[CborPart], loop: str, count: str) -> list[CborPart]:
         """A list comprehension of the elements' bytes."""
-        name = self._source.fresh()
+        name = self._source.new_variable()
         (packed,) = self._merged(value)
         self._source.line(f"{name} = [{packed} {loop}]")
         return self.gathered(name, count)
 
-    def result(self, value: list[Piece]) -> str:
+    def result(self, value: list[CborPart]) -> str:
         """All parts joined."""
         merged = self._merged(value)
         if len(merged) == 1:
             return merged[0]
         return f"{self._source.constant(b''.join)}({self._parts(value)})"
 
-    def _sized(self, start: int, name: str) -> list[Piece]:
-        return [Piece("BI", (str(start), f"len({name})")), Piece("", (name,))]
+    def _sized(self, start: int, name: str) -> list[CborPart]:
+        return [CborPart("BI", (str(start), f"len({name})")), CborPart("", (name,))]
 
-    def _parts(self, value: list[Piece]) -> str:
+    def _parts(self, value: list[CborPart]) -> str:
         return f"({', '.join(self._merged(value))},)"
 
-    def _merged(self, pieces: list[Piece]) -> list[str]:
+    def _merged(self, pieces: list[CborPart]) -> list[str]:
         """Expressions of bytes: neighbouring known and packed pieces as one."""
         found: list[str] = []
-        run: list[Piece] = []
+        run: list[CborPart] = []
         for piece in pieces:
             if piece.code:
                 run.append(piece)
@@ -296,11 +296,11 @@ class CborForm:
                 run = []
         return found + self._packed(run)
 
-    def _packed(self, run: list[Piece]) -> list[str]:
+    def _packed(self, run: list[CborPart]) -> list[str]:
         if not run:
             return []
         codes, values, known = [], list[str](), b""
-        for piece in [*run, Piece("", ())]:
+        for piece in [*run, CborPart("", ())]:
             if piece.values and isinstance(piece.values[0], bytes):
                 known += piece.values[0]
                 continue

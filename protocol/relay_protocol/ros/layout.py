@@ -1,4 +1,4 @@
-"""What is fixed about the messages of a type: how few bytes they take, and which repeat without gaps."""
+"""Memory layout of types: their smallest size in CDR, and which can be repeated without padding."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ from relay_protocol.ros.definition import Definition, FieldType, Shape
 
 
 class Block(NamedTuple):
-    """A message of numbers only, whose copies follow each other without gaps.
+    """A message of numbers only that needs no padding between its copies.
 
     :param size: bytes
-    :param alignment: of its start; every copy starts at a multiple of this
+    :param alignment: every copy starts at a multiple of this, bytes
     """
 
     size: int
     alignment: int
 
 
-class Shapes:
-    """Facts about the types of one text, each found out once."""
+class LayoutTable:
+    """Layouts of the types of one text, each computed once."""
 
     def __init__(self, definitions: dict[str, Definition]) -> None:
         self._definitions = definitions
-        self._least: dict[str, int] = {}
+        self._min_size: dict[str, int] = {}
         self._layouts: dict[str, list[tuple[int, int]] | None] = {}
 
-    def least(self, kind: FieldType) -> int:
+    def min_size(self, kind: FieldType) -> int:
         """Fewest bytes of a field, without padding."""
         if kind.shape is Shape.SEQUENCE:
             return 4
-        return self.least_of_one(kind) * (kind.length or 1)
+        return self.min_element_size(kind) * (kind.length or 1)
 
-    def least_of_one(self, kind: FieldType) -> int:
+    def min_element_size(self, kind: FieldType) -> int:
         """Fewest bytes of one element."""
         if kind.primitive is not None:
             return kind.primitive.size
-        if kind.base not in self._least:
+        if kind.base not in self._min_size:
             fields = self._definitions[kind.base].fields
-            self._least[kind.base] = sum(self.least(field.type) for field in fields) or 1
-        return self._least[kind.base]
+            self._min_size[kind.base] = sum(self.min_size(field.type) for field in fields) or 1
+        return self._min_size[kind.base]
 
     def block(self, name: str) -> Block | None:
         """The message as a block, if it is one."""

@@ -1,7 +1,7 @@
-"""msgspec's structs for the types of one text: they decode JSON, check it and fill in defaults, all in one go.
+"""msgspec structs for the types of one text. They decode JSON, check it and fill in defaults.
 
-Their attributes are called ``f0``, ``f1``, …; names of fields are only what these are called in JSON. Nothing is
-passed over: an unknown field, or one of another type than it must be, is an error.
+The attributes are named ``f0``, ``f1``, …; field names are used in JSON only. An unknown field or a wrong type is an
+error.
 """
 
 from __future__ import annotations
@@ -18,40 +18,40 @@ from relay_protocol.ros.definition import BYTES, HEADER, Definition, Field, Fiel
 _DEFAULTS = 20_000
 """Most elements in the default arrays of all structs of one type."""
 _MEMORY = 32 * MIB
-"""Most that structs made of one text may take."""
+"""Most memory of structs decoded from one text, bytes."""
 
 _Kind = Any
 """A type annotation, as msgspec takes it."""
 
 
-class Structs:
-    """Makes the struct of each message when it is first asked for."""
+class StructFactory:
+    """Creates the struct of a message when it is first used."""
 
     def __init__(self, definitions: dict[str, Definition]) -> None:
         self._definitions = definitions
-        self._made: dict[str, type[msgspec.Struct]] = {}
+        self._structs: dict[str, type[msgspec.Struct]] = {}
         self._fields = 0
         self._defaults = 0
-        self.most_fields = 0
+        self.max_fields = 0
 
     def of(self, name: str) -> type[msgspec.Struct]:
-        """The struct of this message; its attributes are in the order of the fields.
+        """The struct of a message; its attributes are in the order of the fields.
 
-        :raises TooLarge: with it, there are too many fields or too long arrays
+        :raises TooLarge: too many fields, or too long default arrays
         """
-        found = self._made.get(name)
+        found = self._structs.get(name)
         if found is None:
-            found = self._made[name] = self._make(self._definitions[name])
+            found = self._structs[name] = self._make(self._definitions[name])
         return found
 
     @property
-    def longest_text(self) -> int:
-        """Longest JSON, in bytes, that can be decoded: a short ``{}`` makes a struct with all its fields."""
-        return 3 * _MEMORY // (24 + 8 * self.most_fields)
+    def max_json_bytes(self) -> int:
+        """Longest JSON that may be decoded, bytes: a short ``{}`` creates a struct with all its fields."""
+        return 3 * _MEMORY // (24 + 8 * self.max_fields)
 
     def _make(self, definition: Definition) -> type[msgspec.Struct]:
         self._fields += len(definition.fields)
-        self.most_fields = max(self.most_fields, len(definition.fields))
+        self.max_fields = max(self.max_fields, len(definition.fields))
         if self._fields > MAX_STEPS:
             raise TooLarge
         parts = []
@@ -95,10 +95,10 @@ _TIME = (("sec", FieldType("int32")), ("nanosec", FieldType("uint32")))
 
 
 def is_stamp(definition: Definition, field: Field) -> bool:
-    """Whether this is the field of a header that is filled with the present time."""
+    """Whether this is the stamp of a header, which defaults to the current time."""
     return definition.name == HEADER and field.name == "stamp"
 
 
 def is_time(definition: Definition | None) -> bool:
-    """Whether a message has the fields of ``builtin_interfaces/Time``, whatever its text calls it."""
+    """Whether a message has the fields of ``builtin_interfaces/Time``, whatever its name."""
     return definition is not None and tuple((field.name, field.type) for field in definition.fields) == _TIME

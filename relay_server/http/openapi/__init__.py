@@ -1,1 +1,1 @@
-"""The HTTP API described, from what stands at its routes."""
+"""The description of the HTTP API as an OpenAPI document and as a page."""

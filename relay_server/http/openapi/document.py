@@ -13,6 +13,7 @@ import msgspec
 from relay_server.http.openapi.operation import (
     JSON,
     PROBLEM,
+    STREAMS,
     ApiOperation,
     Credential,
     Parameter,
@@ -25,34 +26,49 @@ VERSION = "3.1.1"
 IN_PATHS = {
     "robot": "name of a robot",
     "package": "name of a package of ROS",
-    "name": "name of what the robot has, with or without its first slash; a parameter is `<node>:<parameter>`",
-    "id": "what an earlier answer gave as `id`",
-    "number": "what an earlier answer gave as `id`",
+    "name": "name of the resource, with or without its first slash; a parameter is `<node>:<parameter>`",
+    "id": "`id` of an earlier answer",
+    "number": "`id` of an earlier answer",
+    "module": "name of a module",
+    "pipe": "name of a pipe",
+    "function": "name of a function",
+    "job": "id of a job",
+    "role": "name of a Role",
+    "element": "name of an element of the Role in `fierro:`, or its IRI",
+    "action": "`start`, `stop` or `restart`",
 }
-"""What stands in addresses."""
+"""Descriptions of path parameters."""
 
 ABOUT = """\
-Robots dial out, people and programs dial in. What happens live is told by websockets (rosbridge v2); all else is here.
+Robots and clients connect to the relay. Live data comes by websocket (rosbridge v2); everything else is here.
 
-Names, units and meanings are those of the protocol's specification (SPEC sections 1.1 to 1.16). Every error is \
-problem details (RFC 9457); `detail` is for people. A request of more than 64 KiB is 413, one that is not here whole \
-within 10 s 408. `HEAD` works wherever `GET` does. How much a user may ask, or a network from which nobody is known, \
-is told by `RateLimit` and `RateLimit-Policy`; who asks more gets 429 with `Retry-After`. A stop is never held back."""
+Names, units and meanings are those of the protocol's specification (SPEC 1.1 to 1.24). Every error is \
+problem details (RFC 9457); `detail` is for people. A request of more than 56 KiB gets 413, one that has not arrived \
+completely within 10 s gets 408. `HEAD` works wherever `GET` does. `RateLimit` and `RateLimit-Policy` show the limit \
+of a user, or of a network without credentials. Requests over the limit get 429 with `Retry-After`. A stop is never \
+rate limited."""
 
 TAGS = {
-    "session": "Who is logged in",
-    "robots": "Robots, and who is at them",
-    "control": "Who moves a robot; stops",
-    "resources": "What a robot has in its graph",
-    "goals": "Goals that are pursued",
+    "session": "Login, logout and tickets",
+    "foxglove": "URLs for Foxglove and Lichtblick",
+    "robots": "Robots and their users",
+    "control": "Control of robots; stop and resume",
+    "resources": "Resources of a robot's ROS graph",
+    "goals": "Action goals",
     "video": "Cameras",
-    "recordings": "What is recorded",
-    "alerts": "What people should know",
-    "events": "The short-term memory",
-    "directory": "Services and applications, and where they are",
+    "recordings": "Recordings",
+    "modules": "Modules and processes of a robot",
+    "files": "Files that robots have uploaded",
+    "pipes": "Pipes between topics of robots, and programs at their ends",
+    "functions": "Functions that run on the relay's workers",
+    "roles": "Roles: which elements work together, and queries over them",
+    "things": "W3C Web of Things: Thing Descriptions of robots and Roles",
+    "alerts": "Alerts and alert rules",
+    "events": "The event log",
+    "directory": "Registry of services and applications",
     "fleet": "Orders to many robots",
-    "realm": "One's own realm, for its administrators",
-    "oauth": "Tokens for programs and people",
+    "realm": "The caller's realm, for its administrators",
+    "oauth": "Tokens for OAuth clients and users",
     "relay": "The relay itself",
 }
 
@@ -60,25 +76,24 @@ _SECURITY: dict[Credential, list[dict[str, list[str]]]] = {
     Credential.NONE: [],
     Credential.USER: [{"token": []}, {"session": []}],
     Credential.VIEWER: [{"token": []}, {"session": []}, {"ticket": []}],
-    # Where a program is not needed there is no proof of one.
-    Credential.PROGRAM: [{}, {"digest": []}, {"basic": []}],
-    Credential.ASKER: [{"token": []}, {"digest": []}, {"basic": []}],
+    Credential.OAUTH_CLIENT: [{}, {"digest": []}, {"basic": []}],
+    Credential.OAUTH_CLIENT_OR_USER: [{"token": []}, {"digest": []}, {"basic": []}],
 }
 
 _ERRORS = {
     Credential.NONE: (400, 429),
     Credential.USER: (400, 401, 403, 429, 503),
     Credential.VIEWER: (400, 401, 403, 429, 503),
-    Credential.PROGRAM: (429, 503),
-    Credential.ASKER: (429, 503),
+    Credential.OAUTH_CLIENT: (429, 503),
+    Credential.OAUTH_CLIENT_OR_USER: (429, 503),
 }
-"""What can be wrong with any request; what OAuth has of its own stands at its operations."""
+"""Statuses of errors that any request can get; operations of OAuth add their own."""
 
 _LIMITS = {
-    "RateLimit": "what is left: `r` requests now, all of them again in `t` seconds",
+    "RateLimit": "`r` requests are left; the full limit is available again in `t` seconds",
     "RateLimit-Policy": "`q` requests in `w` seconds",
 }
-_RETRY = {"Retry-After": "seconds after which to come again"}
+_RETRY = {"Retry-After": "seconds to wait before the next request"}
 
 _REF = "#/components/schemas/"
 _IN_PATH = re.compile(r"\{(\w+)\}")
@@ -88,7 +103,7 @@ _PARAM = re.compile(r"^:(?:param|ivar) (\w+): (.*)$")
 def document(operations: Iterable[ApiOperation], version: str, cookie: str) -> dict[str, Any]:
     """The OpenAPI document.
 
-    :param version: the relay's
+    :param version: version of the relay
     :param cookie: name of its session cookie
     """
     ordered = sorted(operations, key=lambda each: (list(TAGS).index(each.tag), each.path, each.method))
@@ -119,7 +134,7 @@ def document(operations: Iterable[ApiOperation], version: str, cookie: str) -> d
 
 
 def _schemes(cookie: str) -> dict[str, Any]:
-    session = "for browsers; what changes anything needs an `Origin` that the relay lists"
+    session = "for browsers; requests that change anything need an `Origin` that the relay lists"
     return {
         "token": {"type": "http", "scheme": "bearer", "description": "an access token"},
         "session": {"type": "apiKey", "in": "cookie", "name": cookie, "description": session},
@@ -127,14 +142,14 @@ def _schemes(cookie: str) -> dict[str, Any]:
         "digest": {
             "type": "http",
             "scheme": "digest",
-            "description": "key and secret of a program (RFC 7616)",
+            "description": "id and secret of an OAuth client (RFC 7616)",
         },
-        "basic": {"type": "http", "scheme": "basic", "description": "the same, over TLS alone"},
+        "basic": {"type": "http", "scheme": "basic", "description": "the same, over TLS only"},
     }
 
 
 def _operation(each: ApiOperation, schemas: _Schemas) -> dict[str, Any]:
-    told: dict[str, Any] = {
+    result: dict[str, Any] = {
         "operationId": each.id,
         "tags": [each.tag],
         "summary": each.summary,
@@ -142,32 +157,31 @@ def _operation(each: ApiOperation, schemas: _Schemas) -> dict[str, Any]:
     }
     words = " ".join(filter(None, (each.more, each.lasts)))
     if words:
-        told["description"] = words
+        result["description"] = words
     given = {parameter.name for parameter in each.parameters if parameter.place == "path"}
     named = [name for name in _IN_PATH.findall(each.path) if name not in given]
     parameters = [*(Parameter(name, IN_PATHS[name], str, "path", True) for name in named), *each.parameters]
     if parameters:
-        told["parameters"] = [_parameter(one, schemas) for one in parameters]
+        result["parameters"] = [_parameter(one, schemas) for one in parameters]
     if each.body is not None:
         schema = schemas.of(each.body)
-        # Forms beside JSON have no schema here.
-        content = {
-            media: {"schema": schema} if len(each.media) == 1 or media == JSON else {} for media in each.media
-        }
-        told["requestBody"] = {"required": not each.optional, "content": content}
-    told["responses"] = _responses(each, schemas)
+        # Only JSON and forms have a schema.
+        alone = len(each.media) == 1 and each.body is not bytes
+        content = {media: {"schema": schema} if alone or media == JSON else {} for media in each.media}
+        result["requestBody"] = {"required": not each.optional, "content": content}
+    result["responses"] = _responses(each, schemas)
     if each.lasts:
-        told["x-lasts"] = each.lasts
-    return told
+        result["x-lasts"] = each.lasts
+    return result
 
 
 def _parameter(one: Parameter, schemas: _Schemas) -> dict[str, Any]:
-    told = {"name": one.name, "in": one.place, "description": one.words, "schema": schemas.of(one.type)}
-    return {**told, "required": True} if one.required else told
+    result = {"name": one.name, "in": one.place, "description": one.words, "schema": schemas.of(one.type)}
+    return {**result, "required": True} if one.required else result
 
 
 def _errors(each: ApiOperation) -> set[int]:
-    """Statuses of its errors that are told by :class:`Problem`."""
+    """Statuses of its errors with a :class:`Problem` as body."""
     errors = {*_ERRORS[each.credential], *each.errors}
     if "{" in each.path:
         errors.add(404)
@@ -194,20 +208,26 @@ def _responses(each: ApiOperation, schemas: _Schemas) -> dict[str, Any]:
 
 
 def _answer(answer: Response, schemas: _Schemas) -> dict[str, Any]:
-    told: dict[str, Any] = {"description": answer.words}
-    told["headers"] = {name: _header(words) for name, words in answer.headers.items()} | _shared(_LIMITS)
+    result: dict[str, Any] = {"description": answer.words}
+    result["headers"] = {name: _header(words) for name, words in answer.headers.items()} | _shared(_LIMITS)
     if answer.body is not None or answer.media != (JSON,):
-        told["content"] = {
-            media: {"schema": schemas.of(answer.body)} if media == JSON else {} for media in answer.media
-        }
-    return told
+        result["content"] = {media: _content(answer, media, schemas) for media in answer.media}
+    return result
+
+
+def _content(answer: Response, media: str, schemas: _Schemas) -> dict[str, Any]:
+    if media == JSON:
+        return {"schema": schemas.of(answer.body)}
+    if media in STREAMS and answer.items:
+        return {"schema": schemas.of(answer.items)}
+    return {}
 
 
 def _problem(status: int, schema: dict[str, Any], media: str, words: str = "") -> dict[str, Any]:
-    told: dict[str, Any] = {"description": words or HTTPStatus(status).phrase}
+    result: dict[str, Any] = {"description": words or HTTPStatus(status).phrase}
     if status == 429:
-        told["headers"] = _shared({**_RETRY, **_LIMITS})
-    return {**told, "content": {media: {"schema": schema}}}
+        result["headers"] = _shared({**_RETRY, **_LIMITS})
+    return {**result, "content": {media: {"schema": schema}}}
 
 
 def _shared(headers: Iterable[str]) -> dict[str, Any]:
@@ -222,20 +242,22 @@ class _Schemas:
     """The schemas of all types of some operations."""
 
     def __init__(self, operations: Sequence[ApiOperation]) -> None:
-        # What is no class can't be a key of a dict by its value: it is found again by what it is.
-        # They are kept, so no other object can get an address that is a key here.
+        # Types that are no classes are not hashable by value, so they are looked up by id. They are kept alive, so
+        # no other object can get an id that is a key here.
         types = self._types = {id(each): each for each in _types(operations)}
         made, components = msgspec.json.schema_components(list(types.values()), ref_template=_REF + "{name}")
         names = {name: _plain(name) for name in components}
+        words = _words_by_schema(list(types.values()))
         self._of = {key: _renamed(schema, names) for key, schema in zip(types, made, strict=True)}
         self.components = {
-            names[name]: _worded(_renamed(schema, names)) for name, schema in sorted(components.items())
+            names[name]: _worded(_renamed(schema, names), words.get(name, {}))
+            for name, schema in sorted(components.items())
         }
 
     def of(self, kind: Any) -> dict[str, Any]:
-        """The schema of a type, or a reference to it; of several, that it is one of them."""
+        """The schema of a type, or a reference to it; for a tuple of types, any of them."""
         if isinstance(kind, tuple):
-            return {"anyOf": [self.of(each) for each in kind]}
+            return {"anyOf": [self.of(each) for each in kind]} if len(kind) > 1 else self.of(kind[0])
         schema: dict[str, Any] = self._of[id(kind)]
         return schema
 
@@ -244,14 +266,15 @@ def _types(operations: Sequence[ApiOperation]) -> list[Any]:
     found: list[Any] = [Problem, str]
     for each in operations:
         found += [parameter.type for parameter in each.parameters]
-        found += [answer.body for answer in (*each.answers.values(), *each.problems.values())]
+        for answer in (*each.answers.values(), *each.problems.values()):
+            found += [answer.body, *answer.items]
         found.append(each.body)
     several = [one for each in found for one in (each if isinstance(each, tuple) else (each,))]
     return [each for each in several if each is not None]
 
 
 def _plain(name: str) -> str:
-    """The name of a schema: two types of one name have those of their rooms before it."""
+    """The name of a schema; types of the same name are prefixed with their package."""
     first, *rest = name.split(".")
     return name if not rest else f"{rest[0].capitalize()}{rest[-1]}" if first == "relay_server" else rest[-1]
 
@@ -268,27 +291,51 @@ def _renamed(schema: Any, names: Mapping[str, str]) -> Any:
     }
 
 
-def _worded(schema: dict[str, Any]) -> dict[str, Any]:
-    """A type's schema with its docstring taken apart: the words for each field stand there."""
-    text = inspect.cleandoc(schema.get("description", ""))
-    about, _, rest = text.partition("\n:param") if "\n:param" in text else (text, "", "")
-    words: dict[str, str] = {}
-    name = ""
-    for line in (f":param{rest}" if rest else "").splitlines():
-        found = _PARAM.match(line)
-        if found is not None:
-            name = found[1]
-            words[name] = found[2]
-        elif name and line.strip():
-            words[name] += f" {line.strip()}"
+def _words_by_schema(types: Sequence[Any]) -> dict[str, dict[str, str]]:
+    """Descriptions of the fields of all structs that some types consist of, by the names of their schemas."""
+    found: dict[str, dict[str, str]] = {}
+    waiting: list[Any] = list(msgspec.inspect.multi_type_info(types))
+    while waiting:
+        each = waiting.pop()
+        if (kind := getattr(each, "cls", None)) is not None:
+            full_name = f"{kind.__module__}.{kind.__qualname__}"
+            if full_name in found:
+                continue
+            # msgspec takes the full name if several types have the same.
+            found[kind.__name__] = found[full_name] = field_words(kind)
+        waiting += [field.type for field in getattr(each, "fields", ())]
+        waiting += [*getattr(each, "types", ()), *getattr(each, "item_types", ())]
+        parts = ("type", "item_type", "key_type", "value_type")
+        waiting += [getattr(each, part) for part in parts if hasattr(each, part)]
+    return found
+
+
+def field_words(kind: type) -> dict[str, str]:
+    """Descriptions of fields from the docstrings of a class and its bases."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        name = ""
+        for line in inspect.cleandoc(base.__doc__ or "").splitlines():
+            start = _PARAM.match(line)
+            if start is not None:
+                name = start[1]
+                found[name] = start[2]
+            elif name and line.strip():
+                found[name] += " " + line.strip()
+    return {name: _marked(text) for name, text in found.items()}
+
+
+def _worded(schema: dict[str, Any], words: Mapping[str, str]) -> dict[str, Any]:
+    """A type's schema, its fields with their descriptions."""
+    about = inspect.cleandoc(schema.get("description", "")).partition("\n:param")[0]
     fields = {
-        field: {**value, "description": _marked(words[field])} if field in words else value
+        field: {**value, "description": words[field]} if field in words else value
         for field, value in schema.get("properties", {}).items()
     }
-    told = {key: value for key, value in schema.items() if key != "title"}
+    result = {key: value for key, value in schema.items() if key != "title"}
     if about:
-        told["description"] = _marked(about.strip())
-    return {**told, "properties": fields} if fields else told
+        result["description"] = _marked(about.strip())
+    return {**result, "properties": fields} if fields else result
 
 
 def _marked(text: str) -> str:

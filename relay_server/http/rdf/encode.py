@@ -1,7 +1,9 @@
-"""Resources as graphs of RDF: what a robot says, its parameters, what there is.
+"""Resources as RDF graphs: topics, parameters, cameras, nodes, robots and their collections.
 
-Source: W3C Semantic Sensor Network Ontology. What a sensor says is a ``sosa:Observation``, what moves the robot a
-``sosa:Actuation``; of what else there is, only that it is there is said.
+A message of a sensor becomes a ``sosa:Observation``, a message that moves the robot a ``sosa:Actuation``.
+Other resources are listed without such a role.
+
+Source: W3C Semantic Sensor Network Ontology.
 """
 
 from __future__ import annotations
@@ -19,15 +21,13 @@ from rdflib.term import Node
 from relay_protocol import jsontext
 from relay_protocol.ros.definition import BYTES, Definition, FieldType, Shape
 from relay_server.http.rdf.vocabulary import DATATYPES, TIME, Vocabulary, can_be_field, prefix_of
-from relay_server.resources.etags import ParamState, TopicState
-from relay_server.resources.location import ResourceLocation
-from relay_server.resources.topic_context import TopicContext
+from relay_server.resources.states import ParamState, ResourceLocation, TopicContext, TopicState
 
 LONGEST_LIST = 100
-"""An array that holds more values, all in all, is one literal."""
+"""Values. An array that holds more, nested ones counted, is written as one literal."""
 
 MOST_VALUES = 2000
-"""In a message that holds more, every array is one literal."""
+"""Values. In a message that holds more, every array is written as one literal."""
 
 # XML 1.0 section 2.2; a carriage return would be read as a line feed.
 _UNSAFE = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -39,17 +39,15 @@ _PYTHON: dict[str, tuple[type, ...]] = {
     "float32": (float, int, type(None)),
     "float64": (float, int, type(None)),
 }
-"""What a basic type is in JSON, where that is not an integer."""
+"""The JSON types of those basic types that are not integers."""
 
 _Write = Callable[[Any], str]
 
 
 class ValueGraph:
-    """Puts values into a graph.
+    """Adds values to a graph.
 
-    :param graph: which
-    :param words: the vocabulary
-    :param definitions: of the types that are known, by their full names
+    :param definitions: of the known types, by their full names
     """
 
     def __init__(self, graph: Graph, words: Vocabulary, definitions: Mapping[str, Definition]) -> None:
@@ -63,25 +61,25 @@ class ValueGraph:
     def message(self, type_name: str, value: Any) -> Node:
         """A message as a blank node.
 
-        :param value: decoded JSON; what does not fit the type is written as what it is
+        :param value: decoded JSON; values that do not fit the type are written as the JSON types they have
         """
-        self._see(value)
+        self._choose_list_limit(value)
         return self._message(type_name, value)
 
-    def say(self, subject: Node, word: str, value: Any) -> None:
-        """Say something of a resource in the relay's own words.
+    def add_fact(self, subject: Node, word: str, value: Any) -> None:
+        """Add a fact about a resource, in the relay's own words.
 
         :param value: decoded JSON
         """
-        self._graph.add((subject, self._words.own[word], self.anything(value)))
+        self._graph.add((subject, self._words.own[word], self.untyped(value)))
 
-    def anything(self, value: Any) -> Node:
-        """Any decoded JSON."""
-        self._see(value)
+    def untyped(self, value: Any) -> Node:
+        """A node for decoded JSON whose type is not known."""
+        self._choose_list_limit(value)
         return self._plain(value)
 
-    def _see(self, value: Any) -> None:
-        self._longest = 0 if larger(value, MOST_VALUES) else LONGEST_LIST
+    def _choose_list_limit(self, value: Any) -> None:
+        self._longest = 0 if holds_more_than(value, MOST_VALUES) else LONGEST_LIST
 
     def _message(self, name: str, value: Any) -> Node:
         definition = self._definitions.get(name)
@@ -95,7 +93,7 @@ class ValueGraph:
         for field in definition.fields:
             if field.name in value:
                 self._graph.add((node, names[field.name], self._field(field.type, value[field.name])))
-        if name == TIME and (moment := _moment(value)) is not None:
+        if name == TIME and (moment := _date_time_of(value)) is not None:
             self._graph.add((node, self._words.own.dateTime, moment))
         return node
 
@@ -113,7 +111,7 @@ class ValueGraph:
             return Literal(value, datatype=XSD.base64Binary)
         if not isinstance(value, list):
             return self._plain(value)
-        if larger(value, self._longest):
+        if holds_more_than(value, self._longest):
             return self._long(kind, value)
         return self._list([self._one(kind, each) for each in value])
 
@@ -125,21 +123,22 @@ class ValueGraph:
         datatype = DATATYPES[kind.base]
         if datatype == XSD.string:
             return self._text(value)
-        return Literal(_written(kind)(value), datatype=datatype)
+        return Literal(_writer_for(kind)(value), datatype=datatype)
 
     def _long(self, kind: FieldType, values: list[Any]) -> Node:
         python = set(_PYTHON.get(kind.base, (int,)))
         numbers = kind.primitive is not None and kind.primitive.code
         if not numbers or not set(map(type, values)) <= python:
             return _json(values)
-        return Literal(" ".join(map(_written(kind), values)), datatype=self._words.many(DATATYPES[kind.base]))
+        return Literal(
+            " ".join(map(_writer_for(kind), values)), datatype=self._words.list_of(DATATYPES[kind.base])
+        )
 
     def _plain(self, value: Any) -> Node:
-        """What has no definition."""
         if isinstance(value, str):
             return self._text(value)
         if isinstance(value, list):
-            if larger(value, self._longest):
+            if holds_more_than(value, self._longest):
                 return _json(value)
             return self._list([self._plain(each) for each in value])
         if isinstance(value, dict):
@@ -177,8 +176,8 @@ class ValueGraph:
         return Literal(base64.b64encode(text.encode()).decode(), datatype=self._words.own.base64Text)
 
 
-def larger(value: Any, most: int) -> bool:
-    """Whether a value holds more than so many; no longer looked at than it takes to know.
+def holds_more_than(value: Any, most: int) -> bool:
+    """Whether a value holds more than ``most`` values. Counting stops there.
 
     :param value: decoded JSON
     """
@@ -194,7 +193,7 @@ def larger(value: Any, most: int) -> bool:
     return False
 
 
-def moment_of(seconds: int, nanoseconds: int) -> Literal:
+def date_time(seconds: int, nanoseconds: int) -> Literal:
     """A time as ``xsd:dateTime``, in UTC and to the nanosecond."""
     seconds, nanoseconds = seconds + nanoseconds // 10**9, nanoseconds % 10**9
     day = (_EPOCH + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%S")
@@ -202,17 +201,17 @@ def moment_of(seconds: int, nanoseconds: int) -> Literal:
     return Literal(f"{day}{part}Z", datatype=XSD.dateTime)
 
 
-def _moment(value: Mapping[str, Any]) -> Literal | None:
+def _date_time_of(value: Mapping[str, Any]) -> Literal | None:
     seconds, nanoseconds = value.get("sec"), value.get("nanosec")
     if type(seconds) is not int or type(nanoseconds) is not int:
         return None
     if not -(2**31) <= seconds < 2**31 or not 0 <= nanoseconds < 2**32:
         return None
-    return moment_of(seconds, nanoseconds)
+    return date_time(seconds, nanoseconds)
 
 
 def _number(value: Any) -> str:
-    """A number, or a boolean; ``null`` is what is not a number (SPEC section 4)."""
+    """A number or a boolean; ``null`` stands for NaN (SPEC 4)."""
     if value is None:
         return "NaN"
     return str(value).lower() if isinstance(value, bool) else repr(value)
@@ -222,18 +221,18 @@ def _real(value: Any) -> str:
     return "NaN" if value is None else repr(float(value))
 
 
-def _written(kind: FieldType) -> _Write:
+def _writer_for(kind: FieldType) -> _Write:
     return _real if kind.base in ("float32", "float64") else _number
 
 
 def _json(value: Any) -> Literal:
     text = jsontext.encode(value).decode()
-    # Within strings alone, since what else is unsafe JSON escapes itself.
+    # Only within strings: JSON escapes all other unsafe characters itself.
     return Literal(_UNSAFE.sub(lambda each: f"\\u{ord(each[0]):04x}", text), datatype=RDF.JSON)
 
 
 _SENSES = ("sensor_msgs/",)
-"""How the types of what is measured begin."""
+"""Prefixes of types that are measured by sensors."""
 
 _MEASURED = frozenset(
     {
@@ -243,123 +242,123 @@ _MEASURED = frozenset(
         "geometry_msgs/msg/TwistWithCovarianceStamped",
     }
 )
-"""Further ones."""
+"""Further types that are measured by sensors."""
 
 _ORDERS = frozenset(
     {"sensor_msgs/msg/Joy", "sensor_msgs/msg/JoyFeedback", "sensor_msgs/msg/JoyFeedbackArray"}
 )
-"""Those that say what is wanted."""
+"""Types of :data:`_SENSES` that are commands."""
 
 
-def state_graph(state: TopicState, shape: TopicContext, place: ResourceLocation) -> Graph:
-    """What a topic says."""
-    graph, words = _graph(place)
-    topic = URIRef(place.of("topics", state.topic))
-    values = ValueGraph(graph, words, shape.definitions)
+def state_graph(state: TopicState, context: TopicContext, location: ResourceLocation) -> Graph:
+    """A topic with its last message."""
+    graph, words = _graph(location)
+    topic = URIRef(location.of("topics", state.topic))
+    values = ValueGraph(graph, words, context.definitions)
     graph.add((topic, RDF.type, words.own.Topic))
-    _say(values, topic, {"name": state.topic, "messageType": state.type})
+    _add_facts(values, topic, {"name": state.topic, "messageType": state.type})
     milliseconds = round(state.at * 1000)
-    graph.add((topic, SOSA.resultTime, moment_of(milliseconds // 1000, milliseconds % 1000 * 10**6)))
-    _made(graph, topic, state.type, shape.moves, place)
+    graph.add((topic, SOSA.resultTime, date_time(milliseconds // 1000, milliseconds % 1000 * 10**6)))
+    _add_origin(graph, topic, state.type, context.moves, location)
     node = values.message(state.type, jsontext.decode_any(state.value))
     graph.add((topic, SOSA.hasResult, node))
-    if (simple := _simple(shape.definitions.get(state.type))) is not None:
+    if (simple := _single_field(context.definitions.get(state.type))) is not None:
         for each in graph.objects(node, words.fields(state.type)[simple]):
             graph.add((topic, SOSA.hasSimpleResult, each))
     return graph
 
 
-def param_graph(param: ParamState, place: ResourceLocation) -> Graph:
-    """A parameter."""
-    graph, words = _graph(place)
-    subject = URIRef(place.of("params", param.name))
+def param_graph(param: ParamState, location: ResourceLocation) -> Graph:
+    graph, words = _graph(location)
+    subject = URIRef(location.of("params", param.name))
     graph.add((subject, RDF.type, words.own.Parameter))
     values = ValueGraph(graph, words, {})
-    _say(values, subject, {"name": param.name})
-    graph.add((subject, words.own.value, values.anything(jsontext.decode_any(param.value))))
+    _add_facts(values, subject, {"name": param.name})
+    graph.add((subject, words.own.value, values.untyped(jsontext.decode_any(param.value))))
     return graph
 
 
-def members_graph(part: str, page: Mapping[str, Any], place: ResourceLocation) -> Graph:
+def members_graph(part: str, page: Mapping[str, Any], location: ResourceLocation) -> Graph:
     """A page of a collection.
 
-    :param page: as JSON has it: the members, with whatever is said of each, and the page's own facts
+    :param page: as in JSON: the members under the key ``part``, and facts about the page
     """
-    graph, words = _graph(place)
-    collection = URIRef(place.of(part))
+    graph, words = _graph(location)
+    collection = URIRef(location.of(part))
     values = ValueGraph(graph, words, {})
     graph.add((collection, RDF.type, words.own.Collection))
-    _say(values, collection, {name: value for name, value in page.items() if name != part})
+    _add_facts(values, collection, {name: value for name, value in page.items() if name != part})
     for each in page[part]:
-        graph.add((collection, RDFS.member, _member(graph, words, part, each, place)))
+        graph.add((collection, RDFS.member, _member(graph, words, part, each, location)))
     return graph
 
 
-def member_graph(part: str, member: Mapping[str, Any], place: ResourceLocation) -> Graph:
-    """One member of a collection, as its page tells of it.
+def member_graph(part: str, member: Mapping[str, Any], location: ResourceLocation) -> Graph:
+    """One member of a collection.
 
-    :param member: as JSON has it
+    :param member: as in JSON
     """
-    graph, words = _graph(place)
-    _member(graph, words, part, member, place)
+    graph, words = _graph(location)
+    _member(graph, words, part, member, location)
     return graph
 
 
-def robot_graph(robot: Mapping[str, Any], place: ResourceLocation) -> Graph:
-    """A robot, and where what it has is told.
+def robot_graph(robot: Mapping[str, Any], location: ResourceLocation) -> Graph:
+    """A robot and the addresses of its collections.
 
-    :param robot: as JSON has it
+    :param robot: as in JSON
     """
-    graph, words = _graph(place)
-    subject = URIRef(place.address)
+    graph, words = _graph(location)
+    subject = URIRef(location.address)
     for each in (words.own.Robot, SOSA.Platform):
         graph.add((subject, RDF.type, each))
     values = ValueGraph(graph, words, {})
-    _say(values, subject, robot)
+    _add_facts(values, subject, robot)
     for part in _MEMBERS:
-        collection = URIRef(place.of(part))
+        collection = URIRef(location.of(part))
         graph.add((subject, words.own.collections, collection))
         graph.add((collection, RDF.type, words.own.Collection))
-        _say(values, collection, {"name": part})
+        _add_facts(values, collection, {"name": part})
     return graph
 
 
-def camera_graph(camera: Mapping[str, Any], place: ResourceLocation) -> Graph:
+def camera_graph(camera: Mapping[str, Any], location: ResourceLocation) -> Graph:
     """A camera.
 
-    :param camera: as JSON has it
+    :param camera: as in JSON
     """
-    graph, words = _graph(place)
-    subject, robot = URIRef(place.of("cameras", camera["name"])), URIRef(place.address)
+    graph, words = _graph(location)
+    subject, robot = URIRef(location.of("cameras", camera["name"])), URIRef(location.address)
     for each in (words.own.Camera, SOSA.Sensor):
         graph.add((subject, RDF.type, each))
     graph.add((subject, SOSA.isHostedBy, robot))
     graph.add((robot, RDF.type, SOSA.Platform))
     values = ValueGraph(graph, words, {})
-    _say(values, subject, {name: value for name, value in camera.items() if name != "addresses"})
-    for what, path in camera["addresses"].items():
-        graph.add((subject, words.own[what], URIRef(place.base + path)))
+    _add_facts(values, subject, {name: value for name, value in camera.items() if name != "addresses"})
+    for relation, path in camera["addresses"].items():
+        graph.add((subject, words.own[relation], URIRef(location.base + path)))
     return graph
 
 
-def module_graph(module: Mapping[str, Any], place: ResourceLocation) -> Graph:
-    """A module: a system. That the robot hosts it is not said: a node of its graph may run anywhere.
+def node_graph(node: Mapping[str, Any], location: ResourceLocation) -> Graph:
+    """A node of the robot's graph, as an ``ssn:System``. A node may run on any machine, so no platform is
+    named.
 
-    :param module: as JSON has it
+    :param node: as in JSON
     """
-    graph, words = _graph(place)
+    graph, words = _graph(location)
     graph.bind("ssn", SSN)
-    subject = URIRef(place.of("modules", module["name"]))
-    for each in (words.own.Module, SSN.System):
+    subject = URIRef(location.of("nodes", node["name"]))
+    for each in (words.own.Node, SSN.System):
         graph.add((subject, RDF.type, each))
-    _say(ValueGraph(graph, words, {}), subject, {"name": module["name"]})
-    for what, target in _links(module, place):
-        graph.add((subject, words.own[what], target))
+    _add_facts(ValueGraph(graph, words, {}), subject, {"name": node["name"]})
+    for relation, target in _links(node, location):
+        graph.add((subject, words.own[relation], target))
     return graph
 
 
 _LINKS = {"publishes": "topics", "subscribes": "topics", "services": "services"}
-"""What a module has of other resources, and the collections these are in."""
+"""Facts of a node that are names of other resources, and the collections of these."""
 
 _MEMBERS = {
     "topics": "Topic",
@@ -367,13 +366,13 @@ _MEMBERS = {
     "actions": "Action",
     "params": "Parameter",
     "cameras": "Camera",
-    "modules": "Module",
+    "nodes": "Node",
 }
-"""What a member of a collection is."""
+"""The class of a collection's members."""
 
 
-def _graph(place: ResourceLocation) -> tuple[Graph, Vocabulary]:
-    graph, words = Graph(bind_namespaces="none"), Vocabulary(place.base)
+def _graph(location: ResourceLocation) -> tuple[Graph, Vocabulary]:
+    graph, words = Graph(bind_namespaces="none"), Vocabulary(location.base)
     own: dict[str, Any] = {"rdf": RDF, "rdfs": RDFS, "xsd": XSD, "sosa": SOSA, "switchboard": words.own}
     for prefix, namespace in own.items():
         graph.bind(prefix, namespace)
@@ -381,20 +380,20 @@ def _graph(place: ResourceLocation) -> tuple[Graph, Vocabulary]:
 
 
 def _member(
-    graph: Graph, words: Vocabulary, part: str, facts: Mapping[str, Any], place: ResourceLocation
+    graph: Graph, words: Vocabulary, part: str, facts: Mapping[str, Any], location: ResourceLocation
 ) -> URIRef:
-    member = URIRef(place.of(part, facts["name"]))
+    member = URIRef(location.of(part, facts["name"]))
     graph.add((member, RDF.type, words.own[_MEMBERS[part]]))
-    told = {name: value for name, value in facts.items() if name not in _LINKS}
-    _say(ValueGraph(graph, words, {}), member, told)
-    for what, target in _links(facts, place):
-        graph.add((member, words.own[what], target))
+    own_facts = {name: value for name, value in facts.items() if name not in _LINKS}
+    _add_facts(ValueGraph(graph, words, {}), member, own_facts)
+    for relation, target in _links(facts, location):
+        graph.add((member, words.own[relation], target))
     return member
 
 
-def _made(graph: Graph, topic: URIRef, type_name: str, moves: bool, place: ResourceLocation) -> None:
-    """How what a topic says came about."""
-    robot = URIRef(place.address)
+def _add_origin(graph: Graph, topic: URIRef, type_name: str, moves: bool, location: ResourceLocation) -> None:
+    """Add the sensor or the actuator that a message comes from."""
+    robot = URIRef(location.address)
     if moves:
         actuator, motion = URIRef(f"{topic}#actuator"), URIRef(f"{robot}#motion")
         graph.add((topic, RDF.type, SOSA.Actuation))
@@ -414,24 +413,24 @@ def _made(graph: Graph, topic: URIRef, type_name: str, moves: bool, place: Resou
     graph.add((robot, RDF.type, SOSA.Platform))
 
 
-def _simple(definition: Definition | None) -> str | None:
-    """The one value of a message that is nothing but that: ``data`` of ``std_msgs``."""
+def _single_field(definition: Definition | None) -> str | None:
+    """The field of a message that has one scalar field only: ``data`` of ``std_msgs``."""
     if definition is None or [each.name for each in definition.fields] != ["data"]:
         return None
     kind = definition.fields[0].type
     return "data" if kind.shape is Shape.SCALAR and kind.primitive is not None else None
 
 
-def _links(facts: Mapping[str, Any], place: ResourceLocation) -> Iterator[tuple[str, URIRef]]:
-    """Facts that are other resources."""
-    for what, part in _LINKS.items():
-        for name in facts.get(what, ()):
-            yield what, URIRef(place.of(part, name))
+def _links(facts: Mapping[str, Any], location: ResourceLocation) -> Iterator[tuple[str, URIRef]]:
+    for relation, part in _LINKS.items():
+        for name in facts.get(relation, ()):
+            yield relation, URIRef(location.of(part, name))
 
 
-def _say(values: ValueGraph, subject: URIRef, facts: Mapping[str, Any]) -> None:
-    """Facts as JSON has them, where lists stand for many in no order; what is empty is left out."""
+def _add_facts(values: ValueGraph, subject: URIRef, facts: Mapping[str, Any]) -> None:
+    """Add facts as JSON has them. A list stands for several values without an order; empty values are left
+    out."""
     for name, value in facts.items():
         for each in value if isinstance(value, list) else [value]:
             if each not in ("", None):
-                values.say(subject, name, each)
+                values.add_fact(subject, name, each)

@@ -1,1 +1,4 @@
-"""ROS 2 as a platform."""
+"""The ROS 2 platform.
+
+Beside it only the guard, ``services/``, ``devices/``, ``navigation/`` and ``sim/`` import rclpy.
+"""

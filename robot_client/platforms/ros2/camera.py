@@ -1,8 +1,9 @@
-"""Cameras in ROS 2: the camera process's node, and what it subscribes to.
+"""The camera process's ROS 2 node and its subscriptions.
 
-It shares no memory with other nodes either: who publishes pictures must not wait for a process that shows them. And
-of 640×480 RGB at 15 Hz a quarter came through shared memory, whose segment is smaller than one of them; by UDP all did
-with 4 MiB of socket buffer, and half with the 208 KiB that Linux grants by default.
+It does not use shared memory either, so that a publisher of images never waits for the camera process.
+Shared memory also lost most large images: of 640×480 RGB at 15 Hz a quarter arrived, since the segment is
+smaller than one image. By UDP all arrived with 4 MiB of socket buffer, and half with Linux's default of 208
+KiB.
 """
 
 from __future__ import annotations
@@ -25,21 +26,21 @@ from robot_client.platforms.ros2.transport import without_shared_memory
 from robot_client.ros_log import ensure_log_folder
 
 DEPTH = 1
-"""Pictures the middleware keeps for us: the newest."""
+"""Depth of subscriptions: only the newest image matters."""
 
-LOOK_EVERY = 1.0
-"""Seconds between two looks at who publishes."""
+CHECK_INTERVAL = 1.0
+"""Seconds between two checks of the publishers."""
 
-_ASKED = {
+_PROFILES = {
     "": QoS(depth=DEPTH),
     "sensor_data": QoS(depth=DEPTH, reliability="best_effort", durability="volatile"),
     "default": QoS(depth=10, reliability="reliable", durability="volatile"),
 }
-"""By the names of ``settings.qos``; what is left out is matched to the publishers."""
+"""By the values of ``settings.qos``; policies that are left out match the publishers."""
 
 
 class RosCameras:
-    """A node that subscribes to pictures, served by a thread.
+    """A node that subscribes to images, with its own thread.
 
     :param name: of the node
     :raises Unavailable: ROS 2 does not start
@@ -61,21 +62,21 @@ class RosCameras:
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._spinner = Spinner(make_executor("single", context), self._node, steady)
         self._subscriptions: set[RosCamera] = set()
-        self._node.create_timer(LOOK_EVERY, self._look, clock=steady)
+        self._node.create_timer(CHECK_INTERVAL, self._check, clock=steady)
         self._spinner.start()
 
     def subscribe(
-        self, topic: str, compressed: bool, qos: str, on_picture: Callable[[bytes], None]
+        self, topic: str, compressed: bool, qos: str, on_message: Callable[[bytes], None]
     ) -> RosCamera:
-        """Have the pictures of a topic, present or not yet.
+        """Subscribe to a topic, which need not exist yet.
 
         :param compressed: whether its messages are CompressedImage
         :param qos: ``""`` to match the publishers, ``sensor_data`` or ``default``
-        :param on_picture: called with each message, in the thread
+        :param on_message: called with each message, on the executor's thread
         """
-        kind = CompressedImage if compressed else Image
-        camera = RosCamera(self._node, kind, topic, _ASKED[qos], on_picture, self._closed)
-        self._spinner.do(self._opened, camera)
+        message_class = CompressedImage if compressed else Image
+        camera = RosCamera(self._node, message_class, topic, _PROFILES[qos], on_message, self._closed)
+        self._spinner.call(self._opened, camera)
         return camera
 
     def close(self) -> None:
@@ -86,76 +87,76 @@ class RosCameras:
 
     def _opened(self, camera: RosCamera) -> None:
         self._subscriptions.add(camera)
-        camera.look()
+        camera.refresh()
 
     def _closed(self, camera: RosCamera) -> None:
-        self._spinner.do(self._drop, camera)
+        self._spinner.call(self._drop, camera)
 
     def _drop(self, camera: RosCamera) -> None:
         self._subscriptions.discard(camera)
         camera.drop()
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         for camera in self._subscriptions:
-            camera.look()
+            camera.refresh()
 
 
 class RosCamera:
-    """One subscription; made, followed and dropped in the executor's thread."""
+    """One subscription; used on the executor's thread, except for :meth:`close` and :attr:`latched`."""
 
     def __init__(
         self,
         node: Any,
-        kind: Any,
+        message_class: Any,
         topic: str,
-        asked: QoS,
-        on_picture: Callable[[bytes], None],
+        qos: QoS,
+        on_message: Callable[[bytes], None],
         on_close: Callable[[RosCamera], None],
     ) -> None:
         self._node = node
-        self._kind = kind
+        self._class = message_class
         self._topic = topic
-        self._asked = asked
-        self._on_picture = on_picture
+        self._qos = qos
+        self._on_message = on_message
         self._on_close = on_close
         self._closed = threading.Event()
         self._subscription: Any = None
         self._profile: QoSProfile | None = None
         self._latest: bytes | None = None
-        self._passed_on: bytes | None = None
-        """What may come again, because it was subscribed anew."""
+        self._repeated: bytes | None = None
+        """A message that may arrive again after a new subscription."""
         self.latched = False
-        """Whether the latest picture was kept for us, and would be for others; to be read from any thread."""
+        """Whether the publisher keeps the latest image for late joiners; may be read from any thread."""
 
     def close(self) -> None:
-        """Listen no more; from any thread."""
+        """End the subscription; from any thread."""
         self._closed.set()
         self._on_close(self)
 
-    def look(self) -> None:
-        """Subscribe as the publishers want it, anew if they want it otherwise than before."""
+    def refresh(self) -> None:
+        """Subscribe with the publishers' quality of service, again if it changed."""
         found = ros2_qos.match(
             [each.qos_profile for each in self._node.get_publishers_info_by_topic(self._topic)]
         )
-        profile = ros2_qos.for_subscription(found, self._asked)
+        profile = ros2_qos.for_subscription(found, self._qos)
         if self._subscription is not None and (found.publishers == 0 or profile == self._profile):
             return
         self.drop()
-        self._profile, self._passed_on = profile, self._latest
+        self._profile, self._repeated = profile, self._latest
         self.latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._subscription = self._node.create_subscription(
-            self._kind, self._topic, self._arrived, profile, raw=True
+            self._class, self._topic, self._arrived, profile, raw=True
         )
 
     def drop(self) -> None:
-        """Give the subscription up."""
+        """Destroy the subscription."""
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
     def _arrived(self, cdr: bytes) -> None:
-        passed_on, self._passed_on = self._passed_on, None
-        if self._closed.is_set() or (self.latched and cdr == passed_on):
+        repeated, self._repeated = self._repeated, None
+        if self._closed.is_set() or (self.latched and cdr == repeated):
             return
         self._latest = cdr
-        self._on_picture(cdr)
+        self._on_message(cdr)

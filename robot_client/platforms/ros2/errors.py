@@ -1,4 +1,4 @@
-"""ROS 2's errors as words for people far from the robot."""
+"""Errors of ROS 2 as texts for clients."""
 
 from __future__ import annotations
 
@@ -11,46 +11,46 @@ from rclpy.validate_namespace import validate_namespace
 
 from relay_protocol.errors import Invalid, SwitchboardError
 
-_PLACE = re.compile(r", at \.{0,2}/")
+_SOURCE_LOCATION = re.compile(r", at \.{0,2}/")
 
 
-def in_words(error: BaseException) -> str:
-    """What an error of rclpy or the middleware says, without the places in their sources that it was built from."""
+def error_text(error: BaseException) -> str:
+    """Text of an error of rclpy or the middleware, without the source locations it contains."""
     text = str(error)
-    place = _PLACE.search(text)
-    if place is not None:
-        text = text[: place.start()]
+    location = _SOURCE_LOCATION.search(text)
+    if location is not None:
+        text = text[: location.start()]
     return text.strip() or type(error).__name__
 
 
 @contextmanager
 def refusals(what: str) -> Iterator[None]:
-    """Say what ROS 2 has against something.
+    """Turn errors of ROS 2 into :class:`Invalid`.
 
-    :param what: what is tried
-    :raises Invalid: it was refused
+    :param what: what is requested, for the error
+    :raises Invalid: ROS 2 refused it
     """
     try:
         yield
     except SwitchboardError:
         raise
     except Exception as error:
-        raise Invalid(f"ROS 2 refuses {what}: {in_words(error)}") from None
+        raise Invalid(f"ROS 2 refuses {what}: {error_text(error)}") from None
 
 
 def check_namespace(namespace: str) -> None:
-    """See that nodes can have this namespace; rclpy would find out only when half of a node is there.
+    """Check a namespace; rclpy would check it only after it has created a part of the node.
 
-    :param namespace: with or without a slash in front; empty for none
-    :raises Invalid: it can't be one
+    :param namespace: with or without a leading slash; empty for none
+    :raises Invalid: it is not valid
     """
     try:
         validate_namespace(namespace if namespace.startswith("/") else f"/{namespace}")
     except NameValidationException as error:
-        raise Invalid(f"'{namespace}' is no ROS namespace: {in_one_line(error)}") from None
+        raise Invalid(f"'{namespace}' is not a ROS namespace: {in_one_line(error)}") from None
 
 
 def in_one_line(error: Exception) -> str:
-    """What rclpy says of a name that can't be, without the arrow it draws below."""
+    """Text of rclpy's error for an invalid name, without the arrow below it."""
     reason, *name = str(error).splitlines()[:2]
     return ": ".join((reason.rstrip(":."), *(each.strip() for each in name)))

@@ -1,40 +1,42 @@
-"""The ROS 2 graph as the relay wants it: by node, which is cheaper than by topic.
+"""The ROS 2 graph, read node by node, which is cheaper than by topic.
 
-Hidden topics are in it, since clients may subscribe to them by name; hidden nodes, services and actions are not.
+Hidden topics are included, since clients may subscribe to them by name; hidden nodes, services and actions
+are not.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from relay_protocol import link
+from relay_protocol.link.motion import SEND_GOAL
 from robot_client.platforms.base import GraphView
 
-GOAL = "/_action/send_goal"
-"""What the service is called that takes an action's goals."""
 GOAL_TYPE = "_SendGoal"
-_UNKNOWN = "_NODE_NAME_UNKNOWN_"
+UNKNOWN = "_NODE_NAME_UNKNOWN_"
+"""Name of the node of an endpoint whose node is not discovered yet, or which has none."""
 
 
-class _Found(NamedTuple):
+class _Topics(NamedTuple):
     types: dict[str, set[str]]
     publishers: dict[str, set[str]]
     subscribers: dict[str, set[str]]
 
 
 def read(node: Any, own: tuple[str, ...]) -> GraphView:
-    """Ask the middleware's cache for everything.
+    """Read the whole graph from the middleware's cache.
 
     :param node: an rclpy node
-    :param own: how the full names of nodes begin that are left out, with all that is theirs alone
+    :param own: prefixes of the full names of nodes that are left out, with everything that only they have
     """
-    topics = _Found(defaultdict(set), defaultdict(set), defaultdict(set))
+    topics = _Topics(defaultdict(set), defaultdict(set), defaultdict(set))
     services: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     nodes = set()
     for name, namespace in node.get_node_names_and_namespaces():
         full = full_name(name, namespace)
-        if full.startswith(own) or name == _UNKNOWN:
+        if full.startswith(own) or name == UNKNOWN:
             continue
         if not hidden(full):
             nodes.add(full)
@@ -56,13 +58,13 @@ def read(node: Any, own: tuple[str, ...]) -> GraphView:
 
 
 def _read_node(
-    node: Any, name: str, namespace: str, full: str, topics: _Found, services: dict[str, dict[str, set[str]]]
+    node: Any, name: str, namespace: str, full: str, topics: _Topics, services: dict[str, dict[str, set[str]]]
 ) -> None:
     try:
         published = node.get_publisher_names_and_types_by_node(name, namespace)
         subscribed = node.get_subscriber_names_and_types_by_node(name, namespace)
         served = node.get_service_names_and_types_by_node(name, namespace)
-    except Exception:  # the node left between two questions; rclpy's error for it has changed its name
+    except Exception:  # the node left between two calls; the class of rclpy's error differs between releases
         return
     for ends, found in ((topics.publishers, published), (topics.subscribers, subscribed)):
         for topic, types in found:
@@ -76,13 +78,13 @@ def _read_node(
 def _split(
     services: dict[str, dict[str, set[str]]],
 ) -> tuple[dict[str, link.Service], dict[str, link.Service]]:
-    """Services, and actions, which are known by the service that takes their goals."""
+    """Split into services and actions, which are recognised by the service that receives their goals."""
     plain: dict[str, link.Service] = {}
     actions: dict[str, link.Service] = {}
     for name, by_type in services.items():
         providers = sorted(set().union(*by_type.values()))
-        if name.endswith(GOAL):
-            action = name[: -len(GOAL)]
+        if name.endswith(SEND_GOAL):
+            action = name[: -len(SEND_GOAL)]
             types = sorted(type[: -len(GOAL_TYPE)] for type in by_type if type.endswith(GOAL_TYPE))
             if types and not hidden(action):
                 actions[action] = link.Service(types=types, providers=providers)
@@ -92,12 +94,12 @@ def _split(
 
 
 def provider(node: Any, service: str, own: tuple[str, ...]) -> str | None:
-    """Which node provides a service, the full name; ``None`` if no other does.
+    """Full name of the node that provides a service; ``None`` if no other node does.
 
-    Asked node by node: the list of all services has those too that somebody only waits for.
+    Read node by node: the list of all services also has those for which there are only clients.
 
     :param node: an rclpy node
-    :param own: names of our own nodes, which don't count
+    :param own: names of our own nodes, which are ignored
     """
     for name, namespace in node.get_node_names_and_namespaces():
         if name in own:
@@ -110,8 +112,13 @@ def provider(node: Any, service: str, own: tuple[str, ...]) -> str | None:
 def _served(node: Any, name: str, namespace: str) -> set[str]:
     try:
         return {each for each, _ in node.get_service_names_and_types_by_node(name, namespace)}
-    except Exception:  # the node left between two questions
+    except Exception:  # the node left between two calls
         return set()
+
+
+def endpoint_ids(endpoints: Iterable[Any]) -> frozenset[bytes]:
+    """GIDs of endpoints (``TopicEndpointInfo``); an endpoint that is created again has another one."""
+    return frozenset(bytes(bytearray(each.endpoint_gid)) for each in endpoints)
 
 
 def full_name(name: str, namespace: str) -> str:
@@ -120,5 +127,5 @@ def full_name(name: str, namespace: str) -> str:
 
 
 def hidden(name: str) -> bool:
-    """Names with a part that begins with ``_`` are not for people (ROS 2 design, topic and service names)."""
+    """Whether a part of the name begins with ``_`` (ROS 2 design, topic and service names)."""
     return "/_" in name

@@ -14,11 +14,11 @@ from robot_client.platforms.ros2.executor import Spinner, make_executor
 from robot_client.platforms.ros2.transport import without_shared_memory
 
 _ACTIONS = "_actions"
-"""What the name of the node for actions adds to ours."""
+"""Suffix of the name of the node for actions."""
 
 
 class Nodes:
-    """One node, and another for actions where they need one.
+    """One node, and another one for actions if they need it.
 
     :param name: of the node
     :param executor: ``events`` or ``single``
@@ -32,10 +32,10 @@ class Nodes:
         self.kind = executor
         self._sim_time = sim_time
         self._context: Any = None
-        self._acting: Spinner | None = None
+        self._for_actions: Spinner | None = None
 
-    def enter(self) -> None:
-        """Make the node; its executor does not turn yet.
+    def start(self) -> None:
+        """Create the node; its executor does not spin yet.
 
         :raises Unavailable: ROS 2 does not start
         """
@@ -43,46 +43,46 @@ class Nodes:
         try:
             with without_shared_memory(rclpy.get_rmw_implementation_identifier()):
                 rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-                self.main = self._spun(self.names[0], self.kind)
+                self.main = self._create(self.names[0], self.kind)
         except Unavailable:
             raise
         except Exception as error:
             raise Unavailable(f"ROS 2 does not start: {error}") from error
 
     def for_actions(self) -> Spinner:
-        """The node that actions are on, made when it is first needed.
+        """The node for actions, created on first use.
 
-        Action servers and clients are what rclpy calls waitables. When one goes while something for it waits in an
-        EventsExecutor, that ends the process (rclpy 7.1): it calls Python without the interpreter's lock.
+        Action servers and clients are waitables. If one is destroyed while an event for it waits in an
+        EventsExecutor, the process crashes (rclpy 7.1): the executor calls Python without holding the GIL.
         """
         if self.kind != "events":
             return self.main
-        if self._acting is None:
-            self._acting = self._spun(self.names[1], "single")
-            self._acting.start()
-        return self._acting
+        if self._for_actions is None:
+            self._for_actions = self._create(self.names[1], "single")
+            self._for_actions.start()
+        return self._for_actions
 
-    def trouble(self) -> str | None:
-        """A sentence when an executor is stuck."""
-        trouble = self.main.trouble()
-        if trouble is None and self._acting is not None:
-            trouble = self._acting.trouble()
-        return trouble
+    def fault(self) -> str | None:
+        """See :meth:`~robot_client.platforms.ros2.executor.Spinner.fault`, of either executor."""
+        fault = self.main.fault()
+        if fault is None and self._for_actions is not None:
+            fault = self._for_actions.fault()
+        return fault
 
     def stop(self) -> None:
-        """Turn no more; the node for actions leaves."""
-        if self._acting is not None:
-            acting, self._acting = self._acting, None
-            acting.stop()
-            acting.node.destroy_node()
+        """Stop the executors; the node for actions is destroyed."""
+        if self._for_actions is not None:
+            spinner, self._for_actions = self._for_actions, None
+            spinner.stop()
+            spinner.node.destroy_node()
         self.main.stop()
 
-    def leave(self) -> None:
+    def destroy(self) -> None:
         """Leave the graph."""
         self.main.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
-    def _spun(self, name: str, executor: str) -> Spinner:
+    def _create(self, name: str, executor: str) -> Spinner:
         node = rclpy.create_node(
             name,
             context=self._context,
@@ -90,6 +90,6 @@ class Nodes:
             enable_rosout=False,
             parameter_overrides=[Parameter("use_sim_time", value=self._sim_time)],
         )
-        # The node's clock stands still when a simulation pauses.
+        # A steady clock: the node's clock stops when a simulation pauses.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         return Spinner(make_executor(executor, self._context), node, steady)

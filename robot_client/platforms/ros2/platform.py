@@ -1,27 +1,31 @@
-"""ROS 2 as a platform, with whatever rclpy the robot has (Humble and later).
+"""The ROS 2 platform, for rclpy of Humble and later.
 
-The executor turns in a thread of its own (:mod:`~robot_client.platforms.ros2.executor`); everything else
-runs on the reactor's thread.
+The executor has its own thread (:mod:`~robot_client.platforms.ros2.executor`); everything else runs on the
+reactor's thread.
 """
 
 from __future__ import annotations
 
+import os
+import platform as machine
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from importlib import metadata
 from typing import Any
 
+import rclpy
 from twisted.internet.defer import Deferred, fail
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
-from robot_client.alerts import OnAlert, nobody
+from robot_client.alerts import OnAlert, ignore_alert
 from robot_client.motion.typed_topic import TypedTopic
 from robot_client.platforms.base import (
     Check,
+    CommandEffect,
     Facts,
     GraphView,
-    Motion,
     OnCall,
     OnCancel,
     OnChange,
@@ -29,46 +33,56 @@ from robot_client.platforms.base import (
     OnSample,
     Platform,
 )
-from robot_client.platforms.ros2 import facts, graph
-from robot_client.platforms.ros2.actions import RosAction
-from robot_client.platforms.ros2.advertisements import RosAdvertisements
-from robot_client.platforms.ros2.battery import BATTERY, BatteryReader
-from robot_client.platforms.ros2.diagnostics import DIAGNOSTICS, Diagnostics
+from robot_client.platforms.ros2 import graph
 from robot_client.platforms.ros2.errors import refusals
 from robot_client.platforms.ros2.executor import ReactorBridge
 from robot_client.platforms.ros2.goals import RosGoal, RosGoals
+from robot_client.platforms.ros2.health import BATTERY, DIAGNOSTICS, BatteryReader, Diagnostics
 from robot_client.platforms.ros2.names import action_type, check_name, service_type, topic_type
 from robot_client.platforms.ros2.nodes import Nodes
+from robot_client.platforms.ros2.offered_services import (
+    RosActionServer,
+    RosOfferedServices,
+    RosServiceServer,
+)
 from robot_client.platforms.ros2.service_calls import RosServiceCalls
-from robot_client.platforms.ros2.services import RosService
-from robot_client.platforms.ros2.topics import Lingering, Offered, RosSink, RosSource, Stamps
+from robot_client.platforms.ros2.topics import (
+    LatchedStamps,
+    LingeringPublishers,
+    PublisherOptions,
+    RosPublisher,
+    RosSubscription,
+)
 from robot_client.platforms.ros2.types import Types
 from robot_client.ros_log import ensure_log_folder
 
-LOOK_EVERY = 3
-"""Looks at the graph from one time all subscriptions look at what their publishers offer to the next."""
+REFRESH_ALL_EVERY = 3
+"""Reads of the graph after which all subscriptions and publishers are refreshed."""
 
-FAREWELL = 0.3
-"""Seconds the last messages have to arrive when the daemon leaves; a stop is among them."""
+CLOSE_SECONDS = 0.3
+"""Seconds in which the last messages must arrive when the daemon stops; a stop is among them."""
+
+_DISTROS = {3: "humble", 4: "iron", 7: "jazzy", 9: "kilted"}
+"""By the major version of rclpy."""
 
 
 class Ros2Platform(Platform):
     """One node in the robot's ROS 2 graph.
 
-    :param reactor: for timers, and for the way back from the executor's thread
+    :param reactor: for timers, and for calls from the executor's thread
     :param name: of the node
-    :param guard: how the names of guards' nodes begin; they are left out of the graph like our own
+    :param guard: prefix of the names of guards' nodes, which are left out of the graph like our own
     :param executor: ``events`` or ``single``
-    :param battery: whether to listen to the first battery topic there is
-    :param diagnostics: whether to tell what ``/diagnostics`` says is wrong
-    :param sim_time: whether the node's clock follows ``/clock``; nothing but stamps goes by it
+    :param battery: whether to read the first battery topic
+    :param diagnostics: whether to raise alerts from ``/diagnostics``
+    :param sim_time: whether the node's clock follows ``/clock``; only stamps use it
     """
 
     encoding = "cdr"
     _calls: RosServiceCalls
     _goals: RosGoals
-    _offers: RosAdvertisements
-    _lingering: Lingering
+    _offered: RosOfferedServices
+    _lingering: LingeringPublishers
 
     def __init__(
         self,
@@ -80,41 +94,43 @@ class Ros2Platform(Platform):
         sim_time: bool = False,
         diagnostics: bool = True,
     ) -> None:
-        self.on_alert: OnAlert = nobody
+        self.on_alert: OnAlert = ignore_alert
         self._reactor = reactor
         self._name = name
         self._guard = guard
         self._sim_time = sim_time
         self._own = tuple("/" + each for each in (name, guard) if each)
         self._types = Types()
-        self._hop = ReactorBridge(reactor.callFromThread)
+        self._bridge = ReactorBridge(reactor.callFromThread)
         self._nodes = Nodes(name, executor, sim_time)
-        self._sources: list[RosSource] = []
-        self._stamps = Stamps()
-        self._sinks: list[RosSink] = []
-        self._seen: Mapping[str, link.Topic] = {}
-        self._looks = 0
-        self._battery = BatteryReader(self._types, self._gauge) if battery else None
+        self._subscriptions: list[RosSubscription] = []
+        self._stamps = LatchedStamps()
+        self._publishers: list[RosPublisher] = []
+        self._last_topics: Mapping[str, link.Topic] = {}
+        self._graph_reads = 0
+        self._battery = BatteryReader(self._types, self._subscribe_battery) if battery else None
         self._diagnostics = (
-            Diagnostics(self._types, self._listen, self._tell, reactor.seconds) if diagnostics else None
+            Diagnostics(self._types, self._subscribe_diagnostics, self._alert, reactor.seconds)
+            if diagnostics
+            else None
         )
         self._node: Any = None
 
     @property
     def dropped(self) -> int:
-        """Samples that the reactor was too slow for."""
-        return self._hop.dropped
+        """Samples that were dropped because the reactor was too slow."""
+        return self._bridge.dropped
 
     def start(self) -> None:
-        """Enter the graph."""
+        """Join the graph."""
         ensure_log_folder()
-        self._nodes.enter()
+        self._nodes.start()
         self._node = self._nodes.main.node
-        self._lingering = Lingering(self._node, self._reactor)
-        self._calls = RosServiceCalls(self._node, self._hop, self._types, self._reactor)
-        self._goals = RosGoals(self._nodes.for_actions, self._hop, self._types, self._reactor)
-        self._offers = RosAdvertisements(self._nodes, self._hop, self._types, self._reactor)
-        self._hop.open(self._reactor)
+        self._lingering = LingeringPublishers(self._node, self._reactor)
+        self._calls = RosServiceCalls(self._node, self._bridge, self._types, self._reactor)
+        self._goals = RosGoals(self._nodes.for_actions, self._bridge, self._types, self._reactor)
+        self._offered = RosOfferedServices(self._nodes, self._bridge, self._types, self._reactor)
+        self._bridge.open(self._reactor)
         self._nodes.main.start()
 
     def stop(self) -> None:
@@ -122,82 +138,98 @@ class Ros2Platform(Platform):
         if self._node is None:
             return
         self._calls.close()
-        for source in list(self._sources):
-            source.close()
-        for sink in list(self._sinks):
-            sink.close()
-        offered = self._offers.close()
-        if self._goals.close() or offered:
-            time.sleep(FAREWELL)  # cancels and aborts leave by the executor's thread, unconfirmed
-        self._goals.leave()
-        self._offers.leave()
+        for subscription in list(self._subscriptions):
+            subscription.close()
+        for publisher in list(self._publishers):
+            publisher.close()
+        had_actions = self._offered.close()
+        if self._goals.close() or had_actions:
+            time.sleep(CLOSE_SECONDS)  # the executor's thread sends cancels and aborts, without confirmation
+        self._goals.destroy()
+        self._offered.destroy()
         self._nodes.stop()
-        self._hop.close()
-        self._lingering.end(FAREWELL)
-        self._nodes.leave()
+        self._bridge.close()
+        self._lingering.destroy_all(CLOSE_SECONDS)
+        self._nodes.destroy()
         self._node = None
 
     def facts(self) -> Facts:
-        """ROS 2, its distribution and middleware."""
-        return facts.read(self._sim_time)
+        return Facts(
+            platform="ros2",
+            distro=os.environ.get("ROS_DISTRO", "") or _distro(),
+            extra={
+                "rmw": rclpy.get_rmw_implementation_identifier(),
+                "domain": os.environ.get("ROS_DOMAIN_ID", "0"),
+                "python": machine.python_version(),
+            },
+            sim_time=self._sim_time,
+        )
 
     def graph(self) -> GraphView:
-        """Read the graph; subscriptions follow what changed in it."""
+        """Read the graph; subscriptions and publishers adapt to its changes."""
         view = graph.read(self._node, self._own)
-        self._follow(view)
-        self._calls.sweep()
-        self._goals.sweep()
+        self._refresh(view)
+        self._calls.remove_idle()
+        self._goals.remove_idle()
         if self._battery is not None:
-            self._battery.look(view)
+            self._battery.update(view)
         if self._diagnostics is not None:
-            self._diagnostics.look(view)
+            self._diagnostics.update(view)
         return view
 
-    def _follow(self, view: GraphView) -> None:
-        """Have subscriptions look at their publishers, and publishers at their subscribers, which costs more than the
-        whole graph: where there are others than before, and all of them now and then, for a node may change its mind.
+    def endpoints(self, name: str, kind: str) -> frozenset[bytes]:
+        full = self.full_name(name, kind)
+        find = self._calls.servers if kind == "service" else self._node.get_publishers_info_by_topic
+        # An endpoint whose node is unknown may be our own.
+        return graph.endpoint_ids(
+            each for each in self._of_others(find(full)) if each.node_name != graph.UNKNOWN
+        )
+
+    def _refresh(self, view: GraphView) -> None:
+        """Refresh subscriptions and publishers whose counterparts changed, and all of them sometimes, since
+        a node may change its quality of service. Each refresh costs more than reading the whole graph.
         """
-        before, self._seen = self._seen, view.topics
-        self._looks += 1
-        every = self._looks % LOOK_EVERY == 0
-        for source in list(self._sources):
-            now, then = view.topics.get(source.topic), before.get(source.topic)
-            if every or now is None or then is None or now.publishers != then.publishers:
-                source.refresh()
-        for sink in list(self._sinks):
-            now, then = view.topics.get(sink.topic), before.get(sink.topic)
-            if every or now is None or then is None or now.subscribers != then.subscribers:
-                sink.refresh()
+        before, self._last_topics = self._last_topics, view.topics
+        self._graph_reads += 1
+        refresh_all = self._graph_reads % REFRESH_ALL_EVERY == 0
+        for subscription in list(self._subscriptions):
+            now, then = view.topics.get(subscription.topic), before.get(subscription.topic)
+            if refresh_all or now is None or then is None or now.publishers != then.publishers:
+                subscription.refresh()
+        for publisher in list(self._publishers):
+            now, then = view.topics.get(publisher.topic), before.get(publisher.topic)
+            if refresh_all or now is None or then is None or now.subscribers != then.subscribers:
+                publisher.refresh()
 
     def subscribe(
         self, topic: str, type: str, qos: link.QoS | None, on_sample: OnSample, on_change: OnChange
-    ) -> RosSource:
-        """Listen to a topic, present or not yet."""
+    ) -> RosSubscription:
         topic, full = self.resolve(topic, type)
         with refusals(f"the subscription of {topic} as {full}"):
-            source = RosSource(
+            subscription = RosSubscription(
                 self._node,
-                self._hop,
+                self._bridge,
                 self._types,
                 topic,
                 full,
                 qos,
                 on_sample,
                 on_change,
-                self._sources.remove,
+                self._subscriptions.remove,
                 self._reactor,
                 self._stamps,
                 self._guard,
             )
-        self._sources.append(source)
-        return source
+        self._subscriptions.append(subscription)
+        return subscription
 
     def after_samples(self, call: Callable[[], None]) -> None:
-        """Call when the batch from the executor's thread is done."""
-        self._hop.after(call)
+        """Call at the end of the current batch from the executor's thread."""
+        self._bridge.after(call)
 
     def resolve(self, topic: str, type: str) -> TypedTopic:
-        """Expand the name; the type is what others in the graph use, else what is asked for."""
+        """See :meth:`robot_client.platforms.base.Platform.resolve`. The type is that of other nodes, else
+        the requested one."""
         full = check_name(self._node.resolve_topic_name, topic, "topic")
         theirs, ours = set(), set()
         for each in (
@@ -209,15 +241,14 @@ class Ros2Platform(Platform):
                 theirs.add(each.topic_type)
             elif each.node_name == self._name:
                 ours.add(each.topic_type)
-        # What was commanded in vain, and the guard's readiness to stop it, must not decide for the robot's driver.
+        # A client's publisher with a wrong type, and the guard's for it, must not decide the type.
         types = theirs or (set() if type else ours)
         return TypedTopic(full, topic_type(full, type, sorted(types)))
 
-    def full_name(self, name: str, what: str) -> str:
-        """Expand a name."""
-        service = what == "service"
+    def full_name(self, name: str, kind: str) -> str:
+        service = kind == "service"
         resolve = self._node.resolve_service_name if service else self._node.resolve_topic_name
-        return check_name(resolve, name, what)
+        return check_name(resolve, name, kind)
 
     def advertise(
         self,
@@ -227,103 +258,105 @@ class Ros2Platform(Platform):
         qos: link.QoS | None,
         queue_size: int = 0,
         on_change: OnChange = lambda: None,
-    ) -> RosSink:
-        """Make a publisher."""
+    ) -> RosPublisher:
         topic, full = self.resolve(topic, type)
-        kind = self._types.message(full)
-        self._lingering.give_way(topic, kind)
+        message_class = self._types.message(full)
+        self._lingering.destroy_other_types(topic, message_class)
         with refusals(f"to publish {topic} as {full}"):
-            sink = RosSink(
+            publisher = RosPublisher(
                 self._node,
                 self._reactor,
-                kind,
+                message_class,
                 topic,
-                Offered(latch, qos, queue_size),
-                partial(self._subscriptions, topic),
+                PublisherOptions(latch, qos, queue_size),
+                partial(self._other_subscriptions, topic),
                 on_change,
-                self._sunk,
+                self._publishers_unused,
             )
-        self._sinks.append(sink)
-        return sink
+        self._publishers.append(publisher)
+        return publisher
 
-    def _subscriptions(self, topic: str) -> list[Any]:
-        """What the graph tells of a topic's subscriptions, but for our own, which follow the publishers."""
+    def _other_subscriptions(self, topic: str) -> list[Any]:
+        """Subscriptions of other nodes to a topic; ours adapt to the publishers."""
+        return self._of_others(self._node.get_subscriptions_info_by_topic(topic))
+
+    def _of_others(self, endpoints: Iterable[Any]) -> list[Any]:
         return [
             each
-            for each in self._node.get_subscriptions_info_by_topic(topic)
+            for each in endpoints
             if not graph.full_name(each.node_name, each.node_namespace).startswith(self._own)
         ]
 
-    def _sunk(self, sink: RosSink, publishers: list[Any]) -> None:
-        if sink.closed:
-            self._sinks.remove(sink)
-        for each in publishers:
-            self._lingering.take(each)
+    def _publishers_unused(self, publisher: RosPublisher, unused: list[Any]) -> None:
+        if publisher.closed:
+            self._publishers.remove(publisher)
+        for each in unused:
+            self._lingering.add(each)
 
     def call(
         self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None
     ) -> Deferred[bytes]:
-        """Call a service once."""
         try:
             check_name(self._node.resolve_service_name, service, "service")
             known = self._node.get_service_names_and_types()
-            full = type if self._calls.keeps(service, type) else service_type(service, type, known)
+            full = type if self._calls.is_prepared(service, type) else service_type(service, type, known)
             return self._calls.call(service, full, request, timeout, check)
         except SwitchboardError as error:
             return fail(error)
 
     def prepare_call(self, service: str, type: str) -> None:
-        """Make a client, and keep it."""
         check_name(self._node.resolve_service_name, service, "service")
-        self._calls.keep(service, type)
+        self._calls.prepare(service, type)
 
-    def serve(self, service: str, type: str, on_call: OnCall) -> RosService:
-        """Offer a service."""
-        return self._offers.serve(service, type, on_call)
+    def advertise_service(self, service: str, type: str, on_call: OnCall) -> RosServiceServer:
+        return self._offered.advertise_service(service, type, on_call)
 
-    def act(self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel) -> RosAction:
-        """Offer an action."""
-        return self._offers.act(action, type, on_goal, on_cancel)
+    def advertise_action(
+        self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel
+    ) -> RosActionServer:
+        return self._offered.advertise_action(action, type, on_goal, on_cancel)
 
-    def pursue(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> RosGoal:
-        """Have an action pursue a goal."""
+    def send_goal(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> RosGoal:
         full = check_name(self._node.resolve_topic_name, action, "action")
         name = action_type(full, type, self._node.get_service_names_and_types())
-        return self._goals.pursue(full, name, goal, on_feedback)
+        return self._goals.send_goal(full, name, goal, on_feedback)
 
     def definition(self, type: str) -> link.TypeDefinition:
-        """The text of a type and all it contains."""
         return self._types.definition(type)
 
     def interfaces(self) -> list[str]:
-        """Names of all types that are installed."""
         return self._types.names()
 
-    def judge(self, type: str, body: bytes) -> Motion:
-        """What this command would do."""
-        return self._types.judge(type, body)
+    def classify_command(self, type: str, body: bytes) -> CommandEffect:
+        return self._types.classify_command(type, body)
 
-    def resting(self, type: str, body: bytes) -> bytes:
-        """What the zero that follows this command is like."""
-        return self._types.resting(type, body)
+    def zero_template(self, type: str, body: bytes) -> bytes:
+        return self._types.zero_template(type, body)
 
-    def zero(self, type: str, rest: bytes = b"") -> bytes:
-        """The message that stands still."""
-        return self._types.zero(type, self._node.get_clock().now().to_msg(), rest)
+    def zero_command(self, type: str, template: bytes = b"") -> bytes:
+        return self._types.zero_command(type, self._node.get_clock().now().to_msg(), template)
 
     def battery(self) -> float | None:
-        """Charge as the first battery topic tells it."""
         return None if self._battery is None else self._battery.charge()
 
-    def trouble(self) -> str | None:
-        """Whether an executor is stuck."""
-        return self._nodes.trouble()
+    def fault(self) -> str | None:
+        return self._nodes.fault()
 
-    def _listen(self, topic: str, on_sample: OnSample) -> RosSource:
+    def _subscribe_diagnostics(self, topic: str, on_sample: OnSample) -> RosSubscription:
         return self.subscribe(topic, DIAGNOSTICS, link.QoS(depth=50), on_sample, lambda: None)
 
-    def _tell(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+    def _alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
         self.on_alert(level, text, kind, about, over)
 
-    def _gauge(self, topic: str, on_sample: OnSample) -> RosSource:
+    def _subscribe_battery(self, topic: str, on_sample: OnSample) -> RosSubscription:
         return self.subscribe(topic, BATTERY, link.QoS(depth=1), on_sample, lambda: None)
+
+
+def _distro() -> str:
+    """The distribution, for installations that do not set ``ROS_DISTRO``; empty if unknown."""
+    for name in ("ros-rclpy", "rclpy"):
+        try:
+            return _DISTROS.get(int(metadata.version(name).split(".")[0]), "")
+        except (metadata.PackageNotFoundError, ValueError):
+            continue
+    return ""

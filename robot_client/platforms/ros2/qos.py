@@ -1,4 +1,4 @@
-"""Quality of service matched to who is there."""
+"""Quality of service that matches the publishers and subscribers of the graph."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from relay_protocol.errors import Invalid
 from relay_protocol.link import QoS
 
 DEPTH = 512
-"""Messages the middleware keeps for us: half a second at 1000 a second, while other processes have the processor."""
+"""Depth of subscriptions: half a second at 1000 messages a second, while other processes have the
+processor."""
 
 MAX_DEPTH = 1000
 
 QUEUE_SIZE = 100
-"""Messages a publisher keeps for its subscribers when nobody says how many."""
+"""Default depth of publishers."""
 
 MAX_QUEUE_SIZE = 10_000
 
@@ -36,19 +37,19 @@ _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 _NAMELESS = "a participant without a ROS node"
 
 _TIMES = ("deadline", "liveliness_lease_duration")
-"""What is to be no longer than a subscriber asks for."""
+"""Policies that must not be longer than a subscriber requests."""
 
 _INFINITE = 2**63 - 1
-"""Nanoseconds that stand for no limit (``RMW_DURATION_INFINITE``)."""
+"""Nanoseconds that mean no limit (``RMW_DURATION_INFINITE``)."""
 
 
 class Match(NamedTuple):
-    """What a subscription has to know of its publishers.
+    """Publishers of a topic.
 
-    :param reliable: all of them send again what was lost
-    :param latched: some of them keep messages for late joiners
-    :param publishers: how many there are
-    :param all_latched: whether all of them keep messages
+    :param reliable: whether all are reliable
+    :param latched: whether some keep messages for late joiners
+    :param publishers: their number
+    :param all_latched: whether all keep messages
     """
 
     reliable: bool
@@ -58,7 +59,7 @@ class Match(NamedTuple):
 
 
 def match(publishers: Sequence[QoSProfile]) -> Match:
-    """What suits all these publishers; none yet: the usual."""
+    """Combine the profiles of all publishers."""
     if not publishers:
         return Match(False, False, 0, False)
     latched = [each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers]
@@ -70,19 +71,19 @@ def match(publishers: Sequence[QoSProfile]) -> Match:
     )
 
 
-def for_subscription(found: Match, asked: QoS | None) -> QoSProfile:
-    """The profile to listen with."""
+def for_subscription(found: Match, requested: QoS | None) -> QoSProfile:
+    """Profile of a subscription that all publishers match."""
     profile = QoSProfile(
         depth=DEPTH,
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE if found.reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if found.all_latched else DurabilityPolicy.VOLATILE,
     )
-    return _override(profile, asked)
+    return _override(profile, requested)
 
 
-def for_recall() -> QoSProfile:
-    """The profile to get with what latched publishers keep."""
+def for_latched() -> QoSProfile:
+    """Profile of a subscription for the samples that latched publishers keep."""
     return QoSProfile(
         depth=MAX_DEPTH,
         history=HistoryPolicy.KEEP_LAST,
@@ -92,22 +93,22 @@ def for_recall() -> QoSProfile:
 
 
 def for_publisher(
-    subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | None, queue_size: int = 0
+    subscribers: Sequence[QoSProfile], latch: bool, requested: QoS | None, queue_size: int = 0
 ) -> QoSProfile:
-    """The profile to publish with: it serves every subscriber, but for what is asked for otherwise.
+    """Profile of a publisher that all subscribers match, except for policies that the client requests.
 
-    A subscriber is served by what is at least as strict as it asks for: reliable, durable, with a deadline and a lease
-    of liveliness that are no longer (DDS 1.4, 2.2.3, requested and offered).
+    A subscriber matches if the offer is at least as strict as its request: reliable, durable, and with a
+    deadline and a liveliness lease that are not longer (DDS 1.4, 2.2.3).
 
-    :param queue_size: messages kept for subscribers that are slow; the usual below 1. Latched is the last one alone
-    :raises Invalid: a wish that can't be met
+    :param queue_size: depth; below 1 the default. A latched publisher keeps only the last message
+    :raises Invalid: a requested policy is not possible
     """
-    if asked is not None and asked.history == "keep_all":
-        # The reactor would wait in publish() for as long as one subscriber takes nothing.
-        raise Invalid("qos: what is published keeps the last messages (history keep_last), not all of them")
+    if requested is not None and requested.history == "keep_all":
+        # publish() would block the reactor while a subscriber reads nothing.
+        raise Invalid("qos: publishers need history keep_last; keep_all could block the robot's daemon")
     durable = latch or any(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in subscribers)
     profile = QoSProfile(
-        depth=1 if latch else _queue(queue_size),
+        depth=1 if latch else _depth(queue_size),
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
@@ -119,43 +120,44 @@ def for_publisher(
             setattr(profile, name, Duration(nanoseconds=shortest))
     if any(each.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC for each in subscribers):
         profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
-    return _override(profile, asked)
+    return _override(profile, requested)
 
 
 def mismatch(publisher: QoSProfile, subscription: QoSProfile) -> str:
-    """Why a subscription gets nothing of a publisher, in the middleware's words; empty when it does."""
+    """Why a subscription does not match a publisher, as the middleware explains it; empty if it does."""
     compatible, reason = qos_check_compatible(_explicit(publisher), _explicit(subscription))
     if compatible != QoSCompatibility.ERROR:
         return ""
     parts = [each.removeprefix("ERROR:").strip() for each in reason.split(";")]
-    return "; ".join(each for each in parts if each) or "their qualities of service do not fit"
+    return "; ".join(each for each in parts if each) or "their qualities of service are incompatible"
 
 
-def lossy(servers: Sequence[Any]) -> bool:
-    """Whether a service answers without sending again what was lost (best effort)."""
+def is_best_effort(servers: Sequence[Any]) -> bool:
+    """Whether a service has reliability best effort."""
     return any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for each in servers)
 
 
-def for_service(lossy: bool) -> QoSProfile:
-    """The profile of a service's client: the usual, or one that hears a service of best effort."""
+def for_service(best_effort: bool) -> QoSProfile:
+    """Profile of a service client: the default, or one that matches a best-effort service."""
     profile = copy.copy(qos_profile_services_default)
-    if lossy:
+    if best_effort:
         profile.reliability = ReliabilityPolicy.BEST_EFFORT
     return profile
 
 
 def unsafe_service(servers: Sequence[Any]) -> str:
-    """Why a service that is there is not called, because of its quality of service; empty where there is no reason."""
+    """Why a service must not be called, because of its quality of service; empty if it may."""
     if any(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in servers):
         return (
-            "it asks for durability transient_local, by which a service that starts again carries old requests out "
-            "again; let it be volatile"
+            "it requests durability transient_local, so a restarted service would execute old requests "
+            "again; set it to volatile"
         )
     return ""
 
 
 def _explicit(profile: QoSProfile) -> QoSProfile:
-    """The same with no limit of time spelled out, as in the graph: to the middleware's check 0 is something else."""
+    """The same profile with unlimited times written as infinite: the middleware's check treats 0
+    differently."""
     found = copy.copy(profile)
     for name in _TIMES:
         if not 0 < getattr(found, name).nanoseconds < _INFINITE:
@@ -164,19 +166,19 @@ def _explicit(profile: QoSProfile) -> QoSProfile:
 
 
 def unmatched(publishers: Sequence[Any], subscriptions: Sequence[Any], ours: QoSProfile) -> list[str]:
-    """The nodes that don't hear us, or that we don't hear, with the reasons, sorted.
+    """Nodes whose endpoints do not match ours, with the reasons, sorted.
 
-    :param publishers: what the graph tells of theirs, where ours is a subscription
-    :param subscriptions: what the graph tells of theirs, where ours is a publisher
+    :param publishers: their endpoints, if ours is a subscription
+    :param subscriptions: their endpoints, if ours is a publisher
     """
     found = [(each, mismatch(each.qos_profile, ours)) for each in publishers]
     found += [(each, mismatch(ours, each.qos_profile)) for each in subscriptions]
-    told = {f"{_name(each)}: {reason}"[: limits.NAME] for each, reason in found if reason}
-    return sorted(told)[: limits.FACTS]
+    described = {f"{_name(each)}: {reason}"[: limits.NAME] for each, reason in found if reason}
+    return sorted(described)[: limits.LIST_ITEMS]
 
 
-def named(nodes: list[str]) -> list[str]:
-    """Without those whose name is not known; of a node that has just come that lasts for a moment."""
+def with_known_names(nodes: list[str]) -> list[str]:
+    """Without nodes of unknown name; the name of a new node is unknown for a moment."""
     return [each for each in nodes if not each.startswith(_NAMELESS)]
 
 
@@ -186,43 +188,43 @@ def _name(info: Any) -> str:
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
-def _queue(size: int) -> int:
+def _depth(size: int) -> int:
     return min(size, MAX_QUEUE_SIZE) if size > 0 else QUEUE_SIZE
 
 
-def _override(profile: QoSProfile, asked: QoS | None) -> QoSProfile:
-    if asked is None:
+def _override(profile: QoSProfile, requested: QoS | None) -> QoSProfile:
+    if requested is None:
         return profile
     for name, policies in (
         ("history", HistoryPolicy),
         ("reliability", ReliabilityPolicy),
         ("durability", DurabilityPolicy),
     ):
-        wish = getattr(asked, name)
-        if wish is not None:
-            setattr(profile, name, _policy(name, policies, wish))
-    if asked.depth is not None:
-        if not 0 < asked.depth <= MAX_DEPTH:
-            raise Invalid(f"qos: depth is 1 to {MAX_DEPTH}")
-        profile.depth = asked.depth
+        value = getattr(requested, name)
+        if value is not None:
+            setattr(profile, name, _policy(name, policies, value))
+    if requested.depth is not None:
+        if not 0 < requested.depth <= MAX_DEPTH:
+            raise Invalid(f"qos: depth is {requested.depth}; it must be 1 to {MAX_DEPTH}")
+        profile.depth = requested.depth
     for name in ("deadline", "lifespan"):
-        seconds = getattr(asked, name)
+        seconds = getattr(requested, name)
         if seconds is not None:
             if not 0 < seconds < 1e9:
-                raise Invalid(f"qos: {name} is a time in seconds above 0")
+                raise Invalid(f"qos: {name} is {seconds}; it must be a time in seconds above 0")
             setattr(profile, name, Duration(nanoseconds=int(seconds * 1e9)))
     return profile
 
 
-_WISHES = {
+_VALUES = {
     "history": ("keep_last", "keep_all"),
     "reliability": ("reliable", "best_effort", "best_available"),
     "durability": ("volatile", "transient_local", "best_available"),
 }
 
 
-def _policy(name: str, policies: Any, wish: str) -> Any:
+def _policy(name: str, policies: Any, value: str) -> Any:
     # BEST_AVAILABLE came with Iron.
-    if wish not in _WISHES[name] or not hasattr(policies, wish.upper()):
-        raise Invalid(f"qos: {name} is {', '.join(_WISHES[name])}, not '{wish}'")
-    return getattr(policies, wish.upper())
+    if value not in _VALUES[name] or not hasattr(policies, value.upper()):
+        raise Invalid(f"qos: {name} is '{value}'; it must be one of {', '.join(_VALUES[name])}")
+    return getattr(policies, value.upper())

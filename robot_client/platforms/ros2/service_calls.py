@@ -1,9 +1,9 @@
-"""Service calls of the ROS 2 platform: never blocking, never waiting for a service that is gone."""
+"""Calls of the robot's services: nothing blocks, and a call ends when its service has disappeared."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet.defer import Deferred
@@ -11,121 +11,128 @@ from twisted.internet.defer import Deferred
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from robot_client.platforms.base import Check
 from robot_client.platforms.ros2 import qos
-from robot_client.platforms.ros2.errors import in_words
+from robot_client.platforms.ros2.errors import error_text
 from robot_client.platforms.ros2.executor import ReactorBridge
 from robot_client.platforms.ros2.types import Types
 from robot_client.twisted_types import DelayedCall, ReactorClock
 
-LOOK = 0.02
-"""Seconds between looks for a service whose client was just made."""
+DISCOVERY_POLL = 0.02
+"""Seconds between checks for a service whose client was just created."""
 
-APPEAR = 1.0
-"""Seconds a service in the graph has to be reached."""
+DISCOVERY_SECONDS = 3.0
+"""Seconds in which a service of the graph must be reached. A busy machine discovers in one to two."""
 
-WATCH = 0.25
-GONE = 1.0
-"""Seconds a called service may be out of reach before the call is given up."""
+CHECK_INTERVAL = 0.25
+GONE_SECONDS = 1.0
+"""Seconds for which a called service may be unreachable before the call is given up."""
 
-IDLE = 30.0
+IDLE_SECONDS = 30.0
+"""Seconds after which an unused client is destroyed."""
 
 
-class _ServiceClient(NamedTuple):
+class _ServiceClient:
     """A client of a service.
 
-    :param lossy: whether it takes answers that may be lost, because the service sends no others
+    :param best_effort: whether its reliability is best effort, because the service's is
     """
 
-    client: Any
-    used: list[float]
-    lossy: bool
+    def __init__(self, client: Any, best_effort: bool) -> None:
+        self.client = client
+        self.best_effort = best_effort
+        self.used_at = 0.0
+        """When it was last used, seconds."""
 
 
 class RosServiceCalls:
     """All calls of one node.
 
-    :param clock: timers and seconds
+    :param clock: for timers
     """
 
-    def __init__(self, node: Any, hop: ReactorBridge, types: Types, clock: ReactorClock) -> None:
+    def __init__(self, node: Any, bridge: ReactorBridge, types: Types, clock: ReactorClock) -> None:
         self.node = node
-        self.hop = hop
+        self.bridge = bridge
         self.clock = clock
         self._types = types
         self._clients: dict[tuple[str, str], _ServiceClient] = {}
-        self._kept: set[tuple[str, str]] = set()
-        """Clients that stay, by service and type."""
+        self._prepared: set[tuple[str, str]] = set()
+        """Service and type of clients that are never destroyed."""
         self._pending: set[_RosCall] = set()
 
-    def keep(self, service: str, type: str) -> None:
-        """Make a client that stays: it has found the service long before it is to call it."""
+    def prepare(self, service: str, type: str) -> None:
+        """Create a client that is never destroyed, so that it has discovered the service before the first
+        call."""
         self._client(service, type, self._types.service(type))
-        self._kept.add((service, type))
+        self._prepared.add((service, type))
 
-    def keeps(self, service: str, type: str) -> bool:
-        """Whether there is a client for this that stays."""
-        return (service, type) in self._kept
+    def is_prepared(self, service: str, type: str) -> bool:
+        """Whether there is such a client."""
+        return (service, type) in self._prepared
 
     def call(
         self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None
     ) -> Deferred[bytes]:
-        """Call once; see :meth:`robot_client.platforms.base.Platform.call`."""
+        """See :meth:`robot_client.platforms.base.Platform.call`."""
         kind = self._types.service(type)
         try:
             message = deserialize_message(request, kind.Request)
         except Exception:
-            raise Invalid(f"the arguments for {service} are no request of type {type}") from None
+            raise Invalid(f"the arguments for {service} are not a request of type {type}") from None
         client = self._client(service, type, kind)
         call = _RosCall(self, service, client, message, timeout, self._pending.discard, check)
         self._pending.add(call)
-        call.begin()
+        call.start()
         return call.result
 
-    def sweep(self) -> None:
-        """Destroy the clients nobody used for a while."""
+    def remove_idle(self) -> None:
+        """Destroy clients that were not used for :data:`IDLE_SECONDS`."""
         now = self.clock.seconds()
         busy = {call.client for call in self._pending}
-        for key, (client, used, _) in list(self._clients.items()):
-            if key not in self._kept and client not in busy and now - used[0] > IDLE:
+        for key, known in list(self._clients.items()):
+            idle = known.client not in busy and now - known.used_at > IDLE_SECONDS
+            if idle and key not in self._prepared:
                 del self._clients[key]
-                self.node.destroy_client(client)
+                self.node.destroy_client(known.client)
 
     def close(self) -> None:
-        """Give up everything."""
+        """Give up all calls and destroy all clients."""
         for call in list(self._pending):
             call.give_up(Unavailable("the robot is shutting down"))
         for known in self._clients.values():
             self.node.destroy_client(known.client)
         self._clients.clear()
-        self._kept.clear()
+        self._prepared.clear()
 
     def _client(self, service: str, type: str, kind: Any) -> Any:
         known = self._clients.get((service, type))
         if known is None or not known.client.service_is_ready():
-            known = self._fitting(service, type, kind, known)
-        known.used[0] = self.clock.seconds()
+            known = self._matching_client(service, type, kind, known)
+        known.used_at = self.clock.seconds()
         return known.client
 
-    def _fitting(self, service: str, type: str, kind: Any, known: _ServiceClient | None) -> _ServiceClient:
-        """A client of the quality of service that the service has, where its node is in the graph."""
+    def _matching_client(
+        self, service: str, type: str, kind: Any, known: _ServiceClient | None
+    ) -> _ServiceClient:
+        """A client with the reliability of the service, if its node is in the graph."""
         servers = self.servers(service)
-        lossy = qos.lossy(servers)
+        best_effort = qos.is_best_effort(servers)
         if known is not None:
             busy = any(call.client is known.client for call in self._pending)
-            if busy or not servers or lossy == known.lossy:
+            if busy or not servers or best_effort == known.best_effort:
                 return known
             self.node.destroy_client(known.client)
-        client = self.node.create_client(kind, service, qos_profile=qos.for_service(lossy))
-        made = self._clients[service, type] = _ServiceClient(client, [0.0], lossy)
-        return made
+        client = self.node.create_client(kind, service, qos_profile=qos.for_service(best_effort))
+        created = self._clients[service, type] = _ServiceClient(client, best_effort)
+        return created
 
     def servers(self, service: str) -> list[Any]:
-        """The ends by which a service gets its requests, as the graph tells of them."""
+        """Endpoints in the graph that receive the requests of a service."""
         topic = f"rq{self.node.resolve_service_name(service)}Request"
         return list(self.node.get_subscriptions_info_by_topic(topic, no_mangle=True))
 
 
 class _RosCall:
-    """One call, from looking for the service to its answer."""
+    """One call, from discovery of the service to its response."""
 
     def __init__(
         self,
@@ -146,34 +153,34 @@ class _RosCall:
         self._on_done = on_done
         self._check = check
         self._future: Any = None
-        self._seen = self._began = calls.clock.seconds()
+        self._last_seen = self._began = calls.clock.seconds()
         self._next: DelayedCall | None = None
         self._limit: DelayedCall | None = None
 
-    def begin(self) -> None:
-        """Look for the service; ask it once it is there."""
-        self._limit = self._calls.clock.callLater(self._timeout, self._too_late)
-        self._look()
+    def start(self) -> None:
+        """Send the request once the service is discovered."""
+        self._limit = self._calls.clock.callLater(self._timeout, self._timed_out)
+        self._discover()
 
     def give_up(self, reason: SwitchboardError) -> None:
-        """End without an answer."""
+        """End without a response."""
         self._end()
         self.result.errback(reason)
 
-    def _look(self) -> None:
+    def _discover(self) -> None:
         if self.client.service_is_ready():
-            self._ask()
-        elif self._calls.clock.seconds() - self._began > APPEAR:
-            why = qos.unsafe_service(self._calls.servers(self._service))
-            why = why or "its node is gone or silent"
-            self.give_up(NotFound(f"the service {self._service} can't be reached; {why}"))
+            self._send()
+        elif self._calls.clock.seconds() - self._began > DISCOVERY_SECONDS:
+            reason = qos.unsafe_service(self._calls.servers(self._service))
+            reason = reason or "its node is gone or silent"
+            self.give_up(NotFound(f"the service {self._service} can't be reached; {reason}"))
         else:
-            self._next = self._calls.clock.callLater(LOOK, self._look)
+            self._next = self._calls.clock.callLater(DISCOVERY_POLL, self._discover)
 
-    def _ask(self) -> None:
-        """Send the request, if it may still be sent.
+    def _send(self) -> None:
+        """Send the request if the check allows it.
 
-        Orders of the relay are done on this thread as well: none can come between the judgement and the request.
+        The relay's commands are carried out on this thread too, so none can come between the check and the request.
         """
         try:
             if self._check is not None:
@@ -181,34 +188,34 @@ class _RosCall:
         except SwitchboardError as error:
             self.give_up(error)
             return
-        hop = self._calls.hop
+        bridge = self._calls.bridge
         self._future = self.client.call_async(self._request)
-        self._future.add_done_callback(lambda future: hop.put(self._answered, future))
-        self._seen = self._calls.clock.seconds()
-        self._next = self._calls.clock.callLater(WATCH, self._watch)
+        self._future.add_done_callback(lambda future: bridge.put(self._responded, future))
+        self._last_seen = self._calls.clock.seconds()
+        self._next = self._calls.clock.callLater(CHECK_INTERVAL, self._check_server)
 
-    def _watch(self) -> None:
+    def _check_server(self) -> None:
         now = self._calls.clock.seconds()
         if self.client.service_is_ready():
-            self._seen = now
-        elif now - self._seen > GONE:
-            self.give_up(Unavailable(f"the service {self._service} vanished before it answered"))
+            self._last_seen = now
+        elif now - self._last_seen > GONE_SECONDS:
+            self.give_up(Unavailable(f"the service {self._service} disappeared before it responded"))
             return
-        self._next = self._calls.clock.callLater(WATCH, self._watch)
+        self._next = self._calls.clock.callLater(CHECK_INTERVAL, self._check_server)
 
-    def _answered(self, future: Any) -> None:
-        if self.result.called or self._on_done is _nothing:
+    def _responded(self, future: Any) -> None:
+        if self.result.called or self._on_done is _already_done:
             return
         try:
             body = bytes(serialize_message(future.result()))
         except Exception as error:
-            self.give_up(Unavailable(f"the call of {self._service} failed: {in_words(error)}"))
+            self.give_up(Unavailable(f"the call of {self._service} failed: {error_text(error)}"))
             return
         self._end()
         self.result.callback(body)
 
-    def _too_late(self) -> None:
-        self.give_up(Unavailable(f"the service {self._service} did not answer within {self._timeout:g} s"))
+    def _timed_out(self) -> None:
+        self.give_up(Unavailable(f"the service {self._service} did not respond within {self._timeout:g} s"))
 
     def _end(self) -> None:
         for timer in (self._next, self._limit):
@@ -217,8 +224,8 @@ class _RosCall:
         if self._future is not None and not self._future.done():
             self.client.remove_pending_request(self._future)
         self._on_done(self)
-        self._on_done = _nothing
+        self._on_done = _already_done
 
 
-def _nothing(call: _RosCall) -> None:
-    """Said once already."""
+def _already_done(call: _RosCall) -> None:
+    """Replaces ``on_done`` after its call."""

@@ -1,10 +1,10 @@
-"""How the daemon, its guard and its camera process talk to the robot's graph: by UDP alone where it is of Fast DDS.
+"""DDS transport of the daemon, its guard and its camera process: with Fast DDS only UDP.
 
-Fast DDS prefers shared memory between processes of one machine. Whoever sends there takes a lock in the memory of the
-one who listens, and waits up to a second, again and again, when a listener that was stopped in the wrong moment holds
-it (Fast DDS 2.14: one freeze in 30 at 2,000 messages per second); who meets it anew waits for thirds of a second until
-it shows that it lives. A robot's base that publishes its odometry would be held up by a daemon that is frozen, and
-would not hear the guard's stop meanwhile. Nobody waits for a UDP socket.
+Between processes of one machine Fast DDS prefers shared memory. A sender takes a lock in the memory of the
+receiver. If a receiver is suspended while it holds the lock, the sender waits up to a second, repeatedly
+(Fast DDS 2.14: one freeze in 30 at 2,000 messages per second). A node that discovers it then waits for
+thirds of a second until it shows signs of life. So a suspended daemon would block the robot's base while it
+publishes odometry, and the base would not receive the guard's stop. A UDP socket never blocks the sender.
 """
 
 from __future__ import annotations
@@ -17,22 +17,24 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from relay_protocol.errors import Unavailable
+from robot_client.temporary import temporary_parent
 
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-"""Where Fast DDS 2 and 3 find their settings."""
+"""Variables for the settings of Fast DDS 2 and 3."""
 
-_CHOSEN = (*_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
-"""Settings by which somebody has chosen the transports of this robot; they stand."""
+_USER_SETTINGS = (*_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
+"""If one is set, the robot's owner has chosen its transports, and nothing is changed."""
 
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _LOCALHOST_ONLY = "ROS_LOCALHOST_ONLY"
 _PEERS = "ROS_STATIC_PEERS"
 
 BUFFER = 4 * 1024 * 1024
-"""Bytes asked of the system for what waits to be read: some large pictures. ``net.core.rmem_max`` may allow less."""
+"""Requested bytes of socket buffers: some large images. ``net.core.rmem_max`` may allow less."""
 
 _PARTICIPANTS = 100
-"""Participants of one machine that are looked for, of the 120 that have ports in a domain (DDSI-RTPS 9.6.1.1)."""
+"""Participants of one machine that are discovered, of the 120 that have ports in a domain (DDSI-RTPS
+9.6.1.1)."""
 
 _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
@@ -67,21 +69,21 @@ _PEER = "<locator><udpv4><address>{address}</address></udpv4></locator>"
 
 @contextmanager
 def without_shared_memory(middleware: str) -> Iterator[None]:
-    """Nodes that are made meanwhile, the first of a process, share no memory with others.
+    """Nodes created in this context, the first of a process, do not use shared memory.
 
-    :param middleware: what ``rclpy.get_rmw_implementation_identifier`` says
-    :raises Unavailable: ``ROS_STATIC_PEERS`` names a host that nobody knows
+    :param middleware: from ``rclpy.get_rmw_implementation_identifier``
+    :raises Unavailable: ``ROS_STATIC_PEERS`` names an unknown host
     """
-    if not middleware.startswith("rmw_fastrtps") or any(os.environ.get(each) for each in _CHOSEN):
+    if not middleware.startswith("rmw_fastrtps") or any(os.environ.get(each) for each in _USER_SETTINGS):
         yield
         return
-    with tempfile.TemporaryDirectory(prefix="switchboard-dds-") as folder:
+    with tempfile.TemporaryDirectory(prefix="switchboard-dds-", dir=temporary_parent()) as folder:
         file = Path(folder, "udp.xml")
         file.write_text(profile(os.environ), encoding="utf-8")
         before = dict(os.environ)
         os.environ.update(dict.fromkeys(_PROFILES, str(file)))
         if _on_this_machine(before):
-            # Told to stay on this machine, rmw_fastrtps sets transports of its own, shared memory among them.
+            # Limited to this machine, rmw_fastrtps would set its own transports, among them shared memory.
             os.environ[_RANGE] = "SYSTEM_DEFAULT"
             os.environ.pop(_LOCALHOST_ONLY, None)
         try:
@@ -94,15 +96,15 @@ def without_shared_memory(middleware: str) -> Iterator[None]:
 
 
 def profile(environment: Mapping[str, str]) -> str:
-    """Settings for Fast DDS (its XML profiles) that do what the environment asks of ROS 2, by UDP.
+    """XML profile of Fast DDS with UDP only, which respects the discovery settings of ROS 2.
 
-    :raises Unavailable: ``ROS_STATIC_PEERS`` names a host that nobody knows
+    :raises Unavailable: ``ROS_STATIC_PEERS`` names an unknown host
     """
     interfaces = builtin = ""
     if _on_this_machine(environment):
         peers = [_address(each.strip()) for each in environment.get(_PEERS, "").split(";") if each.strip()]
         if environment.get(_LOCALHOST_ONLY) == "1":
-            peers = []  # as rcl has it
+            peers = []  # as in rcl
         addresses = ["127.0.0.1", *peers]
         builtin = _BUILTIN.format(peers="".join(_PEER.format(address=each) for each in addresses))
         interfaces = "" if peers else _INTERFACES

@@ -1,4 +1,4 @@
-"""ROS 2 types in Python: found by name, described, judged, zeroed."""
+"""Python classes of ROS 2 types by name: definitions, effect of commands, zero commands."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.motion.velocity import form
+from robot_client.motion.velocity import velocity_access
 from robot_client.platforms import definitions
-from robot_client.platforms.base import Motion
-from robot_client.platforms.ros2 import motion
+from robot_client.platforms.base import CommandEffect
+from robot_client.platforms.ros2 import command_classifier
 
-_OF = {"msg": "messages", "srv": "services", "action": "actions"}
+_PLURALS = {"msg": "messages", "srv": "services", "action": "actions"}
 
 
-_OF_ACTION = {"SendGoal": "SendGoalService", "GetResult": "GetResultService"}
+_ACTION_SERVICES = {"SendGoal": "SendGoalService", "GetResult": "GetResultService"}
 _DERIVED = {
     **{("srv", each, "msg"): (each,) for each in ("Request", "Response", "Event")},
     **{("action", each, "msg"): (each,) for each in ("Goal", "Result", "Feedback")},
     ("action", "FeedbackMessage", "msg"): ("Impl", "FeedbackMessage"),
-    **{("action", name, "srv"): ("Impl", each) for name, each in _OF_ACTION.items()},
+    **{("action", name, "srv"): ("Impl", each) for name, each in _ACTION_SERVICES.items()},
     **{
         ("action", f"{name}_{part}", "msg"): ("Impl", each, part)
-        for name, each in _OF_ACTION.items()
+        for name, each in _ACTION_SERVICES.items()
         for part in ("Request", "Response", "Event")
     },
 }
-"""Where the class of a service or an action has those of what ROS makes of it, by its kind, the ending of the name, and
-the kind that is wanted."""
+"""Attributes of a service's or action's class that hold derived types, by its kind, the suffix of the name,
+and the kind of the derived type."""
 
 
 class Interface(NamedTuple):
@@ -44,7 +44,7 @@ class Interface(NamedTuple):
 
 
 class Types:
-    """All types of this robot, each looked up once."""
+    """The types of this robot, each loaded once."""
 
     def __init__(self) -> None:
         self._classes: dict[tuple[str, str], Any] = {}
@@ -74,19 +74,19 @@ class Types:
         return self._class(name, "action")
 
     def _class(self, name: str, kind: str) -> Any:
-        # By kind too: the C library of a service must never be handed to what makes an action.
+        # By kind too: the C library of a service must never be used for an action.
         found = self._classes.get((name, kind))
         if found is None:
             full = definitions.normalise(name, kind)
             package, has, short = full.split("/")
-            made, separator, what = short.partition("_")
-            if separator and (has, what, kind) in _DERIVED:
-                loaded = _load(package, has, made, full)
-                found = _derived(loaded, _DERIVED[has, what, kind], full)
+            base, separator, suffix = short.partition("_")
+            if separator and (has, suffix, kind) in _DERIVED:
+                loaded = _load(package, has, base, full)
+                found = _derived(loaded, _DERIVED[has, suffix, kind], full)
             elif has == kind:
                 found = _load(package, kind, short, full)
             else:
-                raise Invalid(f"{name} is no type of {_OF[kind]}")
+                raise Invalid(f"{name} is not one of the {_PLURALS[kind]}")
             self._classes[name, kind] = found
         return found
 
@@ -106,7 +106,7 @@ class Types:
         return known
 
     def names(self) -> list[str]:
-        """Full names of all types whose definition can be told, sorted; looked for once."""
+        """Full names of all types with a definition, sorted; searched once."""
         if self._names is None:
             self._names = definitions.all_names(self._prefixes)
         return self._names
@@ -118,49 +118,52 @@ class Types:
         package, kind, short = name.split("/")
         try:
             return introspected(_load(package, kind, short, name), kind)
-        except (NotFound, AttributeError):  # the latter for a part of a service, which its package has too
+        except (NotFound, AttributeError):  # AttributeError: a part of a service, which is in its package too
             return None
 
-    def judge(self, type: str, body: bytes) -> Motion:
-        """What a command of this type would do."""
-        speeds = form(type, "cdr")
-        velocity = speeds.read(body) if speeds is not None else None
+    def classify_command(self, type: str, body: bytes) -> CommandEffect:
+        """Whether a command of this type moves the robot."""
+        velocity_form = velocity_access(type, "cdr")
+        velocity = velocity_form.read(body) if velocity_form is not None else None
         if velocity is not None:
             if not velocity.finite:
-                return Motion.INVALID
-            return Motion.MOVING if velocity.moves else Motion.STILL
+                return CommandEffect.INVALID
+            return CommandEffect.MOVING if velocity.moves else CommandEffect.STILL
         try:
             message = deserialize_message(body, self.message(type))
-        except Exception:  # rclpy names its errors differently from release to release
-            return Motion.INVALID
-        return motion.judge(type, message)
+        except Exception:  # rclpy's errors differ between releases
+            return CommandEffect.INVALID
+        return command_classifier.classify(type, message)
 
-    def resting(self, type: str, body: bytes) -> bytes:
-        """The command of the same shape that stands still, without a stamp; empty where all zeros are alike.
+    def zero_template(self, type: str, body: bytes) -> bytes:
+        """The zero command of the same shape, without a stamp; empty for types whose messages all have one
+        shape.
 
-        :param body: a command that was judged
+        :param body: a valid command
         """
-        if type not in motion.SHAPED:
+        if type not in command_classifier.TYPES_WITH_TEMPLATE:
             return b""
         kind = self.message(type)
-        return bytes(serialize_message(motion.rest(type, deserialize_message(body, kind), kind())))
+        return bytes(
+            serialize_message(command_classifier.zero_like(type, deserialize_message(body, kind), kind()))
+        )
 
-    def zero(self, type: str, stamp: Any, rest: bytes = b"") -> bytes:
-        """The message that stands still, with this stamp in its header if it has one.
+    def zero_command(self, type: str, stamp: Any, template: bytes = b"") -> bytes:
+        """The zero command, with this stamp if it has a header.
 
-        :param rest: what :meth:`resting` gave for the last command
+        :param template: from :meth:`zero_template` of the last command
         """
         kind = self.message(type)
-        message = deserialize_message(rest, kind) if rest else kind()
-        if message.get_fields_and_field_types().get("header") == motion.HEADER:
+        message = deserialize_message(template, kind) if template else kind()
+        if message.get_fields_and_field_types().get("header") == command_classifier.HEADER:
             message.header.stamp = stamp
         return bytes(serialize_message(message))
 
 
 def _derived(found: Any, path: tuple[str, ...], name: str) -> Any:
-    """The class of what ROS makes of a service or an action.
+    """The class of a type that ROS derives from a service or an action.
 
-    :raises NotFound: this distribution makes none (before Iron services have no events)
+    :raises NotFound: this distribution does not have it (before Iron, services have no events)
     """
     try:
         for each in path:
@@ -172,15 +175,15 @@ def _derived(found: Any, path: tuple[str, ...], name: str) -> Any:
 
 
 def parse(body: bytes, kind: Any, what: str) -> Any:
-    """The message in these bytes.
+    """Deserialise a message.
 
     :param kind: its class
-    :param what: what it must be, for the error
-    :raises Invalid: the bytes are none
+    :param what: what it should be, for the error
+    :raises Invalid: the bytes are not such a message
     """
     try:
         return deserialize_message(body, kind)
-    except Exception:  # rclpy names its errors differently from release to release
+    except Exception:  # rclpy's errors differ between releases
         raise Invalid(f"the bytes are no {what}") from None
 
 
@@ -192,7 +195,7 @@ def _load(package: str, kind: str, short: str, name: str) -> Any:
     except (ImportError, AttributeError):
         raise NotFound(f"the type {name} is not installed on this robot") from None
     try:
-        # Types of other distributions import well but have no C library for this one.
+        # Types of other distributions can be imported, but have no C library for this one.
         found.__class__.__import_type_support__()
     except Exception:
         raise NotFound(
@@ -202,7 +205,8 @@ def _load(package: str, kind: str, short: str, name: str) -> Any:
 
 
 def _has_interfaces(package: str, kind: str) -> bool:
-    """Whether this looks like a package of interfaces: to import any other, as a client names it, runs its code."""
+    """Whether this is a package of interfaces: importing any other one that a client names would run its
+    code."""
     try:
         spec = importlib.util.find_spec(package)
     except (ImportError, ValueError):
@@ -212,7 +216,7 @@ def _has_interfaces(package: str, kind: str) -> bool:
 
 
 def introspected(found: Any, kind: str) -> str:
-    """The text of a type as its Python class tells it: fields and constants, no comments, no defaults."""
+    """Definition text from a Python class: fields and constants, without comments and defaults."""
     if kind == "srv":
         return f"{_fields(found.Request)}---\n{_fields(found.Response)}"
     if kind == "action":
@@ -223,7 +227,7 @@ def introspected(found: Any, kind: str) -> str:
 def _fields(found: Any) -> str:
     lines = [f"{_constant(name, value)}" for name, value in sorted(_constants(found).items())]
     for field, type in found.get_fields_and_field_types().items():
-        lines.append(f"{_written(type)} {field}")
+        lines.append(f"{_field_type(type)} {field}")
     return "".join(line + "\n" for line in lines)
 
 
@@ -235,7 +239,7 @@ def _constants(found: Any) -> Mapping[str, Any]:
 
 
 def _constant(name: str, value: Any) -> str:
-    # The class keeps a constant's value, not its width; the widest type holds them all.
+    # The class has a constant's value, but not its width; the widest type fits all.
     if isinstance(value, bool):
         return f"bool {name}={str(value).lower()}"
     if isinstance(value, int):
@@ -247,14 +251,14 @@ def _constant(name: str, value: Any) -> str:
     return f'string {name}="{value}"'
 
 
-def _written(type: str) -> str:
-    """A field's type as .msg files write it: ``sequence<double, 3>`` is ``float64[<=3]``."""
+def _field_type(type: str) -> str:
+    """A field's type in the syntax of .msg files: ``sequence<double, 3>`` is ``float64[<=3]``."""
     if type.startswith("sequence<"):
         inner, _, bound = type[len("sequence<") : -1].partition(", ")
-        return f"{_written(inner)}[{'<=' + bound if bound else ''}]"
+        return f"{_field_type(inner)}[{'<=' + bound if bound else ''}]"
     if type.endswith("]"):
         inner, _, size = type[:-1].rpartition("[")
-        return f"{_written(inner)}[{size}]"
+        return f"{_field_type(inner)}[{size}]"
     for plain in ("string", "wstring"):
         if type.startswith(plain + "<"):
             return f"{plain}<={type[len(plain) + 1 : -1]}"

@@ -1,4 +1,4 @@
-"""Actions: of the robot pursued by clients, of clients pursued from the graph."""
+"""Actions: those of the robot used by clients, those of clients used from the graph."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def examples(server: Server) -> None:
 
 
 def pursue(client: Client, order: Any, **fields: Any) -> None:
-    """Send a goal, id ``goal`` unless said otherwise."""
+    """Sends a goal, with id ``goal`` by default."""
     fields = {"id": "goal", "action": FIBONACCI, "action_type": TYPE, "args": {"order": order}, **fields}
     client.send("send_action_goal", **fields)
 
@@ -89,7 +89,7 @@ def test_goal_ids(client: Client) -> None:
 
 @case("send_action_goal", "SPEC 1.2, names and types")
 def test_goal_old_names(client: Client) -> None:
-    """An action without leading slash is taken, and told as it was written."""
+    """An action without leading slash is accepted, and the answers have it as written."""
     pursue(client, 1, action=FIBONACCI.lstrip("/"))
     result = client.until("action_result")
     assert (result["action"], result["status"]) == (FIBONACCI.lstrip("/"), SUCCEEDED)
@@ -186,10 +186,10 @@ def test_goal_wrong_fields(client: Client) -> None:
 
 
 @case("cancel_action_goal", "SPEC 1.3 Errors", suite=NO_STATUS)
-def test_cancel_unknown(told: Client) -> None:
-    """Cancelling a goal that does not exist is told in words."""
-    told.send("cancel_action_goal", id="never", action=FIBONACCI)
-    assert told.until("status", level="error")["msg"]
+def test_cancel_unknown(reported: Client) -> None:
+    """Cancelling a goal that does not exist gives an error with a reason."""
+    reported.send("cancel_action_goal", id="never", action=FIBONACCI)
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("cancel_action_goal", "SPEC 1.2 send_action_goal, a client that leaves")
@@ -216,25 +216,25 @@ class Offer:
         client.lives()
 
     def ask(self, order: int = 3, cancel: bool = False) -> str:
-        """Have the robot pursue a goal; the id the outcome will have."""
+        """The robot sends a goal; returns the id of its result."""
         return self.hand.ask("goal", self.name, TYPE, json.dumps({"order": order}), str(int(cancel)))
 
     def asked(self) -> dict[str, Any]:
-        """The next goal that comes to the client."""
+        """The next goal sent to the client."""
         return dict(self.client.until("send_action_goal", action=self.name))
 
     def feed(self, goal: dict[str, Any], *sequence: int) -> None:
-        """Tell how far it is."""
+        """Sends feedback."""
         values = {"sequence": list(sequence)}
         self.client.send("action_feedback", action=self.name, id=goal["id"], values=values)
 
     def finish(self, goal: dict[str, Any], *sequence: int, **fields: Any) -> None:
-        """Tell that it is over."""
+        """Sends the result."""
         fields = {"result": True, "values": {"sequence": list(sequence)}, **fields}
         self.client.send("action_result", action=self.name, id=goal["id"], **fields)
 
     def outcome(self, asked: str) -> dict[str, Any]:
-        """What the robot got."""
+        """The robot's result."""
         (answer,) = self.hand.answer(asked, 2 * self.hand.waits)
         return dict(json.loads(answer))
 
@@ -278,7 +278,7 @@ def test_offer_feedback(offer: Offer) -> None:
     goal = offer.asked()
     offer.feed(goal, 0)
     offer.feed(goal, 0, 1)
-    # In ROS 2 feedback and result go different ways: a result may overtake.
+    # In ROS 2 feedback and result have different paths: a result may overtake.
     offer.hand.heard(offer.name, 2)
     offer.finish(goal, 0, 1, 1, status=SUCCEEDED)
     assert [each["sequence"] for each in offer.outcome(asked)["feedback"]] == [[0], [0, 1]]
@@ -331,22 +331,24 @@ def test_offer_client_leaves(hand: Hand, server: Server) -> None:
 
 
 @case("advertise_action", "SPEC 1.2 advertise_action, offered already", suite=NO_STATUS)
-def test_offer_taken(told: Client) -> None:
+def test_offer_taken(reported: Client) -> None:
     """A name the robot offers already is an error in words."""
-    told.send("advertise_action", action=FIBONACCI, type=TYPE)
-    assert told.until("status", level="error")["msg"]
+    reported.send("advertise_action", action=FIBONACCI, type=TYPE)
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("advertise_action", OFFER, suite=NO_STATUS)
-def test_offer_unknown_type(told: Client) -> None:
+def test_offer_unknown_type(reported: Client) -> None:
     """A type that does not exist is an error in words."""
-    told.send("advertise_action", action=fresh_name("action"), type="example_interfaces/action/NoSuchThing")
-    assert told.until("status", level="error")["msg"]
+    reported.send(
+        "advertise_action", action=fresh_name("action"), type="example_interfaces/action/NoSuchThing"
+    )
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("advertise_action", OFFER)
 def test_offer_to_clients(offer: Offer, server: Server) -> None:
-    """Another client can pursue goals on it too."""
+    """Other clients can send goals to it too."""
     with server.connect() as other:
         pursue(other, 9, action=offer.name, id="between")
         goal = offer.asked()
@@ -357,7 +359,7 @@ def test_offer_to_clients(offer: Offer, server: Server) -> None:
 
 @case("unadvertise_action", WITHDRAW)
 def test_withdraw(offer: Offer) -> None:
-    """After unadvertise_action nobody offers it in the robot's graph."""
+    """After unadvertise_action the action is gone from the robot's graph."""
     send_goal = f"{offer.name}/_action/send_goal"
     assert offer.hand.do("offered", send_goal, "1") == ["1"]
     offer.client.send("unadvertise_action", action=offer.name)
@@ -366,7 +368,7 @@ def test_withdraw(offer: Offer) -> None:
 
 @case("unadvertise_action", "SPEC 2.5 unadvertise_action")
 def test_withdraw_during_goal(offer: Offer) -> None:
-    """A goal under way when the action is taken back is aborted."""
+    """A goal under way when the action is withdrawn is aborted."""
     asked = offer.ask()
     offer.asked()
     offer.client.send("unadvertise_action", action=offer.name)
@@ -375,6 +377,6 @@ def test_withdraw_during_goal(offer: Offer) -> None:
 
 @case("unadvertise_action", WITHDRAW)
 def test_withdraw_unknown(client: Client) -> None:
-    """Taking back what was never offered harms nobody."""
+    """Withdrawing what was never offered has no effect."""
     client.send("unadvertise_action", action=fresh_name("action"))
     client.lives()

@@ -1,4 +1,4 @@
-"""Control: who moves the robot, as any rosbridge client asks for it."""
+"""Control of the robot, by any rosbridge client."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TWIST = "geometry_msgs/msg/Twist"
 
 @pytest.fixture
 def pair(server: Server) -> Iterator[tuple[Client, Client]]:
-    """Two clients who follow control; whatever a case does, the robot is free and may move after it."""
+    """Two clients that follow control; after each case the robot is free and not stopped."""
     with server.connect() as one, server.connect() as two:
         for each in (one, two):
             each.send("set_level", level="error")
@@ -27,8 +27,8 @@ def pair(server: Server) -> Iterator[tuple[Client, Client]]:
             each.values("/relay/release_control")
 
 
-def told(client: Client, state: str) -> Any:
-    """The next word of ``/relay/control`` that tells this state."""
+def reported(client: Client, state: str) -> Any:
+    """The next message on ``/relay/control`` with this state."""
     while True:
         message = client.until("publish", topic="/relay/control")["msg"]
         if message["state"] == state:
@@ -37,21 +37,21 @@ def told(client: Client, state: str) -> Any:
 
 @case("call_service", f"{CONTROL}, /relay/take_control")
 def test_control_take(pair: tuple[Client, Client]) -> None:
-    """A free robot becomes the caller's; everybody who follows is told whose."""
+    """A free robot becomes the caller's; all followers receive the new controller."""
     one, two = pair
     assert one.values("/relay/take_control", {"why": "a case"})["success"] is True
-    mine, other = told(one, "held"), told(two, "held")
+    mine, other = reported(one, "held"), reported(two, "held")
     assert mine["holder"]["you"] is True
     assert mine["you"]["client"] == mine["holder"]["client"]
     assert other["holder"]["you"] is False
     assert other["you"]["client"] != other["holder"]["client"]
     assert one.values("/relay/release_control")["success"] is True
-    assert told(two, "free")["holder"] is None
+    assert reported(two, "free")["holder"] is None
 
 
 @case("call_service", f"{CONTROL}, answers")
 def test_control_answers(pair: tuple[Client, Client]) -> None:
-    """What can't be is answered with success false and a sentence."""
+    """Impossible requests are answered with success false and a reason."""
     one, _ = pair
     for service in ("release_control", "grant_control", "refuse_control"):
         answer = one.values(f"/relay/{service}")
@@ -61,19 +61,21 @@ def test_control_answers(pair: tuple[Client, Client]) -> None:
 
 @case("publish", f"{CONTROL}, the first command")
 def test_control_first_command(pair: tuple[Client, Client], hand: Hand, topic: str) -> None:
-    """The first command takes a free robot and is obeyed; who publishes there meanwhile hears who has control."""
+    """The first command takes a free robot and is obeyed; another publisher gets the controller's name in an
+    error.
+    """
     one, two = pair
     hand.listen(topic, TWIST)
     one.send("advertise", topic=topic, type=TWIST)
     for _ in range(20):
         one.send("publish", topic=topic, msg={"linear": {"x": 0.1}})
-    assert told(one, "held")["holder"]["you"] is True
-    told(two, "held")
+    assert reported(one, "held")["holder"]["you"] is True
+    reported(two, "held")
 
 
 @case("call_service", f"{CONTROL}, /relay/stop")
 def test_control_stop(pair: tuple[Client, Client]) -> None:
-    """A stop is told with who and why, until somebody resumes."""
+    """A stop is published with user and reason, until a resume."""
     one, two = pair
     answer = one.values("/relay/stop", {"why": "a case"})
     assert (answer["success"], answer["done"]) == (True, True)
@@ -88,7 +90,7 @@ def test_control_stop(pair: tuple[Client, Client]) -> None:
 
 @case("call_service", f"{CONTROL}, /relay/suppress, /relay/inhibit")
 def test_control_times(client: Client) -> None:
-    """Times that can't be are refused in words."""
+    """Invalid durations are refused with a reason."""
     for service, ms in (("suppress", 20), ("suppress", 201), ("inhibit", -1), ("inhibit", 60_001)):
         answer = client.call(f"/relay/{service}", {"resource": "/conformance/cmd_vel", "ms": ms})
         assert answer["result"] is False, (service, ms)
@@ -97,7 +99,7 @@ def test_control_times(client: Client) -> None:
 
 @case("call_service", f"{CONTROL}, /relay/inhibit")
 def test_control_inhibit(client: Client) -> None:
-    """A topic that is inhibited says nothing, and speaks again when that is ended."""
+    """An inhibited topic sends no samples, and continues when the inhibition ends."""
     client.send("subscribe", topic="/conformance/counter", type="std_msgs/msg/Int64")
     client.until("publish", topic="/conformance/counter")
     asked = {"resource": "/conformance/counter", "ms": 30_000}

@@ -1,4 +1,4 @@
-"""Other forms of the same messages: fragments both ways, PNG, CBOR, raw CBOR."""
+"""Other formats of the same messages: fragments in both directions, PNG, CBOR, raw CBOR."""
 
 from __future__ import annotations
 
@@ -23,13 +23,16 @@ NO_COMPRESSION_OF_CALLS = "answers of services and actions are never compressed 
 SIZE_OF_CLIENT = (
     "fragment_size is the connection's, set by whichever message named one last (protocol.py, incoming)"
 )
+SAME_ID = "fragments of all messages have the id 0 (protocol.py, send; fragmentation.py)"
+IN_ORDER_OF_ARRIVAL = "fragments are joined in the order in which they come (defragmentation.py)"
+RAW_FOR_ALL = "all clients of a topic get it raw or decoded, as the first one asked (subscribers.py)"
 LONG = "0123456789abcdefghijklmnopqrstuvwxyzäöü🤖" * 30
 
 
 def subscribed(
     client: Client, hand: Hand, topic: str, type_name: str, message: object, **fields: object
 ) -> None:
-    """The robot publishes one message on a topic the client has subscribed in some form."""
+    """The robot publishes one message on a topic that the client has subscribed in some format."""
     hand.topic(topic, type_name)
     client.send("subscribe", topic=topic, type=type_name, **fields)
     if fields.get("compression") == "png" or (
@@ -52,7 +55,7 @@ def cut(message: dict, parts: int, name: str) -> list[dict]:
 
 
 def invert(call_id: str) -> dict:
-    """A call whose answer tells that it arrived."""
+    """A call whose answer shows that it arrived."""
     return {"op": "call_service", "id": call_id, "service": "/conformance/invert", "args": {"data": True}}
 
 
@@ -86,7 +89,7 @@ def test_fragment_short_is_whole(client: Client) -> None:
     client.none("fragment", 0.1)
 
 
-@case("fragment", FRAGMENTATION)
+@case("fragment", FRAGMENTATION, suite=SAME_ID)
 def test_fragment_ids_differ(client: Client, hand: Hand, topic: str) -> None:
     """Fragments of two messages have two ids."""
     subscribed(client, hand, topic, STRING, {"data": LONG}, fragment_size=400)
@@ -95,11 +98,12 @@ def test_fragment_ids_differ(client: Client, hand: Hand, topic: str) -> None:
     assert client.fragments()[0]["id"] != first
 
 
-@case("fragment", "rosbridge v2, 3.3.4 Subscribe, several subscriptions")
-def test_fragment_least_size(client: Client, hand: Hand, topic: str) -> None:
-    """Of several subscriptions of one client the least fragment_size counts."""
-    client.send("subscribe", topic=topic, type=STRING, id="large", fragment_size=100_000)
-    subscribed(client, hand, topic, STRING, {"data": "x" * 1000}, id="small", fragment_size=256)
+@case("fragment", "rosbridge v2, 3.3.4 Subscribe, several subscriptions", suite=SIZE_OF_CLIENT)
+@pytest.mark.parametrize("sizes", [(100_000, 256), (256, 100_000)], ids=["least last", "least first"])
+def test_fragment_least_size(client: Client, hand: Hand, topic: str, sizes: tuple[int, int]) -> None:
+    """Of several subscriptions of one client the least fragment_size counts, in whatever order they come."""
+    client.send("subscribe", topic=topic, type=STRING, id="first", fragment_size=sizes[0])
+    subscribed(client, hand, topic, STRING, {"data": "x" * 1000}, id="second", fragment_size=sizes[1])
     assert max(len(part["data"]) for part in client.fragments()) <= 256
 
 
@@ -127,7 +131,7 @@ def test_fragment_in(client: Client) -> None:
     assert client.until("service_response", id="joined")["result"] is True
 
 
-@case("fragment", FRAGMENTATION)
+@case("fragment", FRAGMENTATION, suite=IN_ORDER_OF_ARRIVAL)
 def test_fragment_in_any_order(client: Client) -> None:
     """A client's fragments are joined by their num, in whatever order they come."""
     for part in reversed(cut(invert("shuffled"), 5, "f2")):
@@ -188,12 +192,12 @@ BAD = {
 
 @case("fragment", "SPEC 1.6 and 1.3", suite=NO_STATUS)
 @pytest.mark.parametrize("what", BAD)
-def test_fragment_in_nonsense(told: Client, what: str) -> None:
+def test_fragment_in_nonsense(reported: Client, what: str) -> None:
     """Fragments that make no sense are refused in words, and the connection lives."""
     for fields in BAD[what]:
-        told.send("fragment", id="nonsense", **fields)
-    assert told.until("status", level="error")["msg"]
-    told.lives()
+        reported.send("fragment", id="nonsense", **fields)
+    assert reported.until("status", level="error")["msg"]
+    reported.lives()
 
 
 @case("fragment", "SPEC 1.6, dropped until num 0")
@@ -208,7 +212,7 @@ def test_fragment_in_again(client: Client) -> None:
 
 @case("fragment", "SPEC 1.6, less than 64 counts as 64")
 def test_fragment_size_tiny(server: Server, hand: Hand, topic: str) -> None:
-    """A fragment_size below 64 counts as 64, told by a warning."""
+    """A fragment_size below 64 counts as 64, with a warning."""
     with server.connect() as client:
         client.send("set_level", level="warning")
         subscribed(client, hand, topic, STRING, {"data": "x" * 500}, fragment_size=1)
@@ -218,21 +222,21 @@ def test_fragment_size_tiny(server: Server, hand: Hand, topic: str) -> None:
 
 
 @case("fragment", "SPEC 1.6, 16 messages at a time")
-def test_fragment_in_too_many(told: Client) -> None:
+def test_fragment_in_too_many(reported: Client) -> None:
     """More than 16 unfinished messages at a time are refused in words, and the connection lives."""
     for number in range(17):
-        told.send("fragment", id=f"open-{number}", data="{", num=0, total=2)
-    assert told.until("status", level="error")["msg"]
-    told.lives()
+        reported.send("fragment", id=f"open-{number}", data="{", num=0, total=2)
+    assert reported.until("status", level="error")["msg"]
+    reported.lives()
 
 
-@case("fragment", "SPEC 1.6, 1 MiB together")
-def test_fragment_in_too_large(told: Client) -> None:
-    """Unfinished messages of more than 1 MiB together are refused in words, and the connection lives."""
+@case("fragment", "SPEC 1.6, 10 MB together")
+def test_fragment_in_too_large(reported: Client) -> None:
+    """Unfinished messages of more than 10 MB together are refused in words, and the connection lives."""
     for number in range(3):
-        told.send("fragment", id="large", data="x" * 500_000, num=number, total=4)
-    assert told.until("status", level="error")["msg"]
-    told.lives()
+        reported.send("fragment", id="large", data="x" * 4_000_000, num=number, total=4)
+    assert reported.until("status", level="error")["msg"]
+    reported.lives()
 
 
 # --- large samples ---
@@ -428,9 +432,9 @@ def test_raw_of_answers(client: Client) -> None:
     assert cbor2.loads(data)["values"] == {"success": True, "message": "inverted"}
 
 
-@case("cbor-raw", "rosbridge v2, 3.3.4 Subscribe, compression")
+@case("cbor-raw", "rosbridge v2, 3.3.4 Subscribe, compression", suite=RAW_FOR_ALL)
 def test_every_client_its_own_form(server: Server, hand: Hand, topic: str) -> None:
-    """Five clients on one topic each get it in the form they asked for."""
+    """Five clients on one topic each get it in their requested format."""
     forms = (
         {},
         {"compression": "png"},
@@ -459,7 +463,7 @@ def test_every_client_its_own_form(server: Server, hand: Hand, topic: str) -> No
 
 @case("png", "RFC 2083, 3; RFC 4648, 4")
 def test_png_reader() -> None:
-    """The suite's own PNG reader reads what a plain writer writes."""
+    """The suite's own PNG reader reads the output of a plain writer."""
     text = b'{"op": "publish"}\n'
     rows = b"".join(b"\0" + text[at : at + 9] for at in range(0, 18, 9))
 

@@ -1,4 +1,4 @@
-"""What holds for every operation: status, errors, limits, credentials, the address itself."""
+"""Rules for every operation: status, errors, limits, credentials, the address itself."""
 
 from __future__ import annotations
 
@@ -34,60 +34,60 @@ def test_status_unasked(client: Client) -> None:
 
 
 @case("status", "SPEC 1.2 status", suite=NO_STATUS)
-def test_status(told: Client) -> None:
+def test_status(reported: Client) -> None:
     """A status has a level, a msg for people, and the id of what it is about."""
-    told.send("publish", id="mine", topic=fresh_name(), msg={})
-    status = told.until("status")
+    reported.send("publish", id="mine", topic=fresh_name(), msg={})
+    status = reported.until("status")
     assert status["level"] == "error"
     assert len(status["msg"]) > 10
     assert status["id"] == "mine"
 
 
 @case("set_level", "SPEC 1.2 set_level", suite=NO_STATUS)
-def test_set_level_none(told: Client) -> None:
+def test_set_level_none(reported: Client) -> None:
     """After set_level none no status comes any more."""
-    told.send("no_such_operation")
-    told.until("status")
-    told.send("set_level", level="none")
-    told.send("no_such_operation")
-    told.lives()
-    told.none("status")
+    reported.send("no_such_operation")
+    reported.until("status")
+    reported.send("set_level", level="none")
+    reported.send("no_such_operation")
+    reported.lives()
+    reported.none("status")
 
 
 @case("set_level", "SPEC 1.2 set_level", suite=NO_STATUS)
 @pytest.mark.parametrize("level", ["info", "warning", "error"])
 def test_set_level(client: Client, level: str) -> None:
-    """Errors are told at every level but none."""
+    """Errors are sent at every level but none."""
     client.send("set_level", level=level)
     client.send("no_such_operation")
     assert client.until("status", level="error")["msg"]
 
 
 @case("set_level", "SPEC 1.2 set_level", suite=NO_STATUS)
-def test_set_level_of_one_client(told: Client, client: Client) -> None:
+def test_set_level_of_one_client(reported: Client, client: Client) -> None:
     """The level is of one client, not of all."""
     client.send("no_such_operation")
-    told.send("no_such_operation")
-    told.until("status")
+    reported.send("no_such_operation")
+    reported.until("status")
     client.none("status")
 
 
 @case("set_level", ERRORS, suite=NO_STATUS)
-def test_set_level_unknown(told: Client) -> None:
+def test_set_level_unknown(reported: Client) -> None:
     """A level that doesn't exist is an error in words, and the old one stays."""
-    told.send("set_level", level="shouting")
-    assert told.until("status", level="error")["msg"]
+    reported.send("set_level", level="shouting")
+    assert reported.until("status", level="error")["msg"]
 
 
 # --- messages ---
 
 
 @case("any op", ENVELOPE, suite=NO_STATUS)
-def test_unknown_op(told: Client) -> None:
+def test_unknown_op(reported: Client) -> None:
     """An unknown op is answered with an error that names it, and the connection lives."""
-    told.send("make_coffee", id="please")
-    assert "make_coffee" in told.until("status", level="error")["msg"]
-    told.lives()
+    reported.send("make_coffee", id="please")
+    assert "make_coffee" in reported.until("status", level="error")["msg"]
+    reported.lives()
 
 
 BAD = {
@@ -108,25 +108,27 @@ BAD = {
 
 @case("any op", ERRORS + "; RFC 8259", suite=NO_STATUS)
 @pytest.mark.parametrize("what", BAD)
-def test_bad_message(told: Client, what: str) -> None:
-    """What is no rosbridge is answered with an error in words, and the connection lives."""
-    told.send_raw(BAD[what])
-    assert told.until("status", level="error")["msg"]
-    told.lives()
+def test_bad_message(reported: Client, what: str) -> None:
+    """A message that is not rosbridge is answered with an error and a reason, and the connection lives."""
+    reported.send_raw(BAD[what])
+    assert reported.until("status", level="error")["msg"]
+    reported.lives()
 
 
 @case("any op", ERRORS, suite=NO_STATUS)
 @pytest.mark.parametrize(("op", "missing"), [("call_service", "service"), ("send_action_goal", "action")])
-def test_request_without_name(told: Client, op: str, missing: str) -> None:
-    """A call or goal with neither name nor id, which no answer could be known by, is told of what it lacks."""
-    told.send(op, args={})
-    assert missing in told.until("status", level="error")["msg"]
-    told.lives()
+def test_request_without_name(reported: Client, op: str, missing: str) -> None:
+    """A call or goal with neither name nor id gets an error that names the missing field, since no answer
+    could match it.
+    """
+    reported.send(op, args={})
+    assert missing in reported.until("status", level="error")["msg"]
+    reported.lives()
 
 
 @case("any op", ERRORS)
 def test_bad_messages_live(client: Client) -> None:
-    """What is no rosbridge harms nobody, also without set_level."""
+    """Messages that are not rosbridge have no other effect, also without set_level."""
     for text in BAD.values():
         if "half" not in text:
             client.send_raw(text)
@@ -135,16 +137,16 @@ def test_bad_messages_live(client: Client) -> None:
 
 @case("any op", "SPEC 1, nesting at most 64", suite=NO_STATUS)
 @pytest.mark.parametrize("depth", [65, 5000, 200_000])
-def test_deep(told: Client, depth: int) -> None:
+def test_deep(reported: Client, depth: int) -> None:
     """Nesting beyond 64 is answered with an error in words, and the connection lives."""
-    told.send_raw('{"op":"publish","topic":"/x","msg":{"data":' + "[" * depth + "]" * depth + "}}")
-    assert told.until("status", level="error")["msg"]
-    told.lives()
+    reported.send_raw('{"op":"publish","topic":"/x","msg":{"data":' + "[" * depth + "]" * depth + "}}")
+    assert reported.until("status", level="error")["msg"]
+    reported.lives()
 
 
 @case("any op", "SPEC 1, unknown fields")
 def test_unknown_fields(client: Client) -> None:
-    """Unknown fields are passed over."""
+    """Unknown fields are ignored."""
     answer = client.call("/conformance/invert", {"data": False}, favourite_colour="blue", nested={"a": [1]})
     assert answer["result"] is True
 
@@ -158,12 +160,12 @@ def test_null(client: Client) -> None:
 
 
 @case("any op", "SPEC 1, numbers within the range", suite=NO_STATUS)
-def test_large_number(told: Client) -> None:
+def test_large_number(reported: Client) -> None:
     """A number beyond double and 64 bits is answered with an error in words."""
-    told.send_raw(
+    reported.send_raw(
         '{"op":"call_service","service":"/conformance/invert","id":"n","args":{"data":' + "9" * 400 + "}}"
     )
-    assert told.until("status", level="error")["msg"]
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("any op", "SPEC 5, a message from a client; RFC 6455, 7.4.1")
@@ -186,6 +188,20 @@ def test_binary(client: Client) -> None:
     """A binary message closes the connection with 4403."""
     client.send_raw(json.dumps({"op": "no matter"}).encode())
     assert client.closed() == 4403
+
+
+@case("status", "SPEC 1.4-2", suite=NO_STATUS)
+@pytest.mark.parametrize(
+    ("sent", "code"), [(b"{}", 4403), ("x" * 10_000_001, 1009)], ids=["binary", "oversized"]
+)
+def test_status_before_a_close(reported: Client, sent: str | bytes, code: int) -> None:
+    """Before the close frame a status has the reason."""
+    with contextlib.suppress(ConnectionClosed):
+        reported.send_raw(sent)
+    status = reported.until("status", id="closed")
+    assert status["level"] == "error"
+    assert len(status["msg"]) > 10
+    assert reported.closed() == code
 
 
 @case("any op", "RFC 6455, 8.1", suite=NO_1007)
@@ -249,7 +265,7 @@ def test_auth(server: Server) -> None:
 
 @case("auth", "SPEC 1.1; rosauth on every connection")
 def test_auth_again(client: Client, server: Server) -> None:
-    """auth on a connection that is logged in already harms nobody."""
+    """auth on a connection that is logged in already has no effect."""
     client.send("auth", mac=server.token or "x")
     client.lives()
 
@@ -264,8 +280,8 @@ def test_auth_wrong(server: Server) -> None:
 
 
 @case("auth", "SPEC 1.1, the first message", suite=NO_AUTH)
-def test_nothing_before_auth(server: Server) -> None:
-    """Before auth nothing is done: the call is not answered, the connection closed with 4401."""
+def test_no_operation_before_auth(server: Server) -> None:
+    """Before auth no operation is executed: the call is not answered, the connection closed with 4401."""
     server.needs_token()
     with Client(server.url) as client:
         client.send("call_service", id="early", service="/conformance/invert", args={"data": True})
@@ -291,7 +307,7 @@ def test_subprotocol(server: Server) -> None:
 
 @case("auth", "SPEC 1.1, the same answer", suite=NO_AUTH)
 def test_no_such_robot(server: Server) -> None:
-    """A robot that does not exist is refused, by a close code or a status that says no more than that."""
+    """A robot that does not exist is refused, by a close code or a status without further information."""
     server.needs_token()
     nobody = server.url.rpartition("/")[0] + "/no-such-robot"
     assert closes_or_refuses(nobody, server.token) in (403, 404, 4403, 4404)
@@ -330,7 +346,7 @@ def test_http_get(server: Server) -> None:
 
 @case("any op", "SPEC 1, one websocket is one client")
 def test_many_clients(server: Server) -> None:
-    """Ten clients at once are served, and none sees what another asked for."""
+    """Ten clients at once are served, and none gets another's messages."""
     clients = [server.connect() for _ in range(10)]
     try:
         for number, each in enumerate(clients):

@@ -1,4 +1,4 @@
-"""rosapi: questions about the graph, answered as services."""
+"""rosapi: queries about the graph, answered as services."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TYPEDEF = {"type", "fieldnames", "fieldtypes", "fieldarraylen", "examples", "con
 
 
 def typedef(typedefs: list[dict], type_name: str) -> dict:
-    """The definition of one type, written pkg/msg/Name or pkg/Name; all others are of the same shape."""
+    """The definition of one type, written pkg/msg/Name or pkg/Name; all others have the same form."""
     assert all(set(each) == TYPEDEF for each in typedefs)
     short = type_name.replace("/msg/", "/").replace("/srv/", "/").replace("/action/", "/")
     found = [each for each in typedefs if each["type"] in (type_name, short)]
@@ -38,8 +38,8 @@ def test_topics(client: Client) -> None:
 
 
 @case("rosapi topics", SECTION.format("Topics"))
-def test_topics_appear_and_vanish(client: Client, hand: Hand, topic: str) -> None:
-    """topics follows the graph: what appears is listed, what vanishes is not."""
+def test_topics_appear_and_end(client: Client, hand: Hand, topic: str) -> None:
+    """topics follows the graph: new topics are listed, ended ones are not."""
 
     def listed(wanted: bool) -> None:
         until = time.monotonic() + client.patience
@@ -55,7 +55,7 @@ def test_topics_appear_and_vanish(client: Client, hand: Hand, topic: str) -> Non
 
 @case("rosapi topics", SECTION.format("TopicsForType"))
 def test_topics_for_type(client: Client) -> None:
-    """topics_for_type lists the topics of a type, and none for a type nobody uses."""
+    """topics_for_type lists the topics of a type, and none for an unused type."""
     assert COUNTER in client.values("/rosapi/topics_for_type", {"type": "std_msgs/msg/Int64"})["topics"]
     assert client.values("/rosapi/topics_for_type", {"type": "sensor_msgs/msg/Illuminance"})["topics"] == []
 
@@ -71,7 +71,7 @@ def test_topics_and_raw_types(client: Client) -> None:
 
 @case("rosapi topics", SECTION.format("TopicType"))
 def test_topic_type(client: Client) -> None:
-    """topic_type tells the type of a topic."""
+    """topic_type returns the type of a topic."""
     args = {"topic": COUNTER}
     assert client.values("/rosapi/topic_type", args) == {"type": "std_msgs/msg/Int64"}
 
@@ -114,14 +114,14 @@ def test_services_for_type(client: Client) -> None:
 
 @case("rosapi services", SECTION.format("ServiceType"))
 def test_service_type(client: Client) -> None:
-    """service_type tells the type of a service."""
+    """service_type returns the type of a service."""
     args = {"service": INVERT}
     assert client.values("/rosapi/service_type", args) == {"type": "std_srvs/srv/SetBool"}
 
 
 @case("rosapi services", SECTION.format("ServiceNode"))
 def test_service_node(client: Client) -> None:
-    """service_node tells the node that offers a service."""
+    """service_node returns the node that offers a service."""
     assert client.values("/rosapi/service_node", {"service": INVERT}) == {"node": NODE}
 
 
@@ -143,7 +143,7 @@ def test_nodes(client: Client) -> None:
 
 @case("rosapi nodes", SECTION.format("NodeDetails"))
 def test_node_details(client: Client) -> None:
-    """node_details tells what a node publishes, subscribes to and offers."""
+    """node_details returns what a node publishes, subscribes to and offers."""
     values = client.values("/rosapi/node_details", {"node": NODE})
     assert COUNTER in values["publishing"]
     assert "/conformance/echo/in" in values["subscribing"]
@@ -162,7 +162,7 @@ def test_action_servers(client: Client, server: Server) -> None:
 
 @case("rosapi actions", SECTION.format("ActionType"))
 def test_action_type(client: Client, server: Server) -> None:
-    """action_type tells the type of an action."""
+    """action_type returns the type of an action."""
     server.needs_examples()
     args = {"action": FIBONACCI}
     assert client.values("/rosapi/action_type", args) == {"type": "example_interfaces/action/Fibonacci"}
@@ -173,7 +173,7 @@ def test_action_type(client: Client, server: Server) -> None:
     ("part", "fields"), [("goal", ["order"]), ("result", ["sequence"]), ("feedback", ["sequence"])]
 )
 def test_action_details(client: Client, server: Server, part: str, fields: list[str]) -> None:
-    """action_goal_details, action_result_details and action_feedback_details tell the parts of an action."""
+    """action_goal_details, action_result_details and action_feedback_details return the parts of an action."""
     server.needs_examples()
     args = {"type": "example_interfaces/action/Fibonacci"}
     typedefs = client.values(f"/rosapi/action_{part}_details", args)["typedefs"]
@@ -218,7 +218,7 @@ def test_interfaces(client: Client) -> None:
 @case("rosapi types", SECTION.format("MessageDetails"))
 @pytest.mark.parametrize("name", ["geometry_msgs/msg/PoseStamped", "geometry_msgs/PoseStamped"])
 def test_message_details(client: Client, name: str) -> None:
-    """message_details tells the fields of a message and of every message in it."""
+    """message_details returns the fields of a message and of every message in it."""
     typedefs = client.values("/rosapi/message_details", {"type": name})["typedefs"]
     pose = typedef(typedefs, "geometry_msgs/msg/PoseStamped")
     assert pose["fieldnames"] == ["header", "pose"]
@@ -232,7 +232,7 @@ def test_message_details(client: Client, name: str) -> None:
 
 @case("rosapi types", SECTION.format("MessageDetails"))
 def test_message_details_lists(client: Client) -> None:
-    """message_details tells lists by fieldarraylen: -1 none, 0 any length, else the length."""
+    """message_details describes lists by fieldarraylen: -1 none, 0 any length, else the length."""
     typedefs = client.values("/rosapi/message_details", {"type": "sensor_msgs/msg/CameraInfo"})["typedefs"]
     info = typedef(typedefs, "sensor_msgs/msg/CameraInfo")
     lengths = dict(zip(info["fieldnames"], info["fieldarraylen"], strict=True))
@@ -241,7 +241,7 @@ def test_message_details_lists(client: Client) -> None:
 
 @case("rosapi types", SECTION.format("MessageDetails"))
 def test_message_details_constants(client: Client) -> None:
-    """message_details tells constants."""
+    """message_details returns constants."""
     typedefs = client.values("/rosapi/message_details", {"type": "sensor_msgs/msg/NavSatStatus"})["typedefs"]
     status = typedef(typedefs, "sensor_msgs/msg/NavSatStatus")
     constants = dict(zip(status["constnames"], status["constvalues"], strict=True))
@@ -250,14 +250,14 @@ def test_message_details_constants(client: Client) -> None:
 
 @case("rosapi types", SECTION.format("MessageDetails"))
 def test_message_details_unknown(client: Client) -> None:
-    """message_details of a type that does not exist is answered, with an error or with nothing."""
+    """message_details of a type that does not exist is answered, with an error or with an empty list."""
     answer = client.call("/rosapi/message_details", {"type": "std_msgs/msg/NoSuchThing"})
     assert answer["result"] is False or answer["values"]["typedefs"] == []
 
 
 @case("rosapi types", SECTION.format("ServiceRequestDetails"))
 def test_service_request_details(client: Client) -> None:
-    """service_request_details tells the fields of a request."""
+    """service_request_details returns the fields of a request."""
     args = {"type": "std_srvs/srv/SetBool"}
     (request,) = client.values("/rosapi/service_request_details", args)["typedefs"]
     assert set(request) == TYPEDEF
@@ -266,7 +266,7 @@ def test_service_request_details(client: Client) -> None:
 
 @case("rosapi types", SECTION.format("ServiceResponseDetails"))
 def test_service_response_details(client: Client) -> None:
-    """service_response_details tells the fields of a response."""
+    """service_response_details returns the fields of a response."""
     args = {"type": "std_srvs/srv/SetBool"}
     (response,) = client.values("/rosapi/service_response_details", args)["typedefs"]
     assert (response["fieldnames"], response["fieldtypes"][1]) == (["success", "message"], "string")
@@ -313,7 +313,7 @@ def test_set_param(client: Client) -> None:
 
 @case("rosapi params", SECTION.format("SetParam"))
 def test_set_param_types(client: Client) -> None:
-    """What set_param sets get_param gives, with its type."""
+    """get_param returns what set_param has set, with its type."""
     name = f"{NODE}:conformance.number"
     try:
         for value in (-3, 2.5, True, "text", [1, 2], [0.5], ["a", "b"]):
@@ -326,14 +326,14 @@ def test_set_param_types(client: Client) -> None:
 
 @case("rosapi params", SECTION.format("HasParam"))
 def test_has_param(client: Client) -> None:
-    """has_param tells whether a parameter exists."""
+    """has_param returns whether a parameter exists."""
     for name, there in ((f"{NODE}:conformance.number", True), (f"{NODE}:no.such", False)):
         assert client.values("/rosapi/has_param", {"name": name})["exists"] is there
 
 
 @case("rosapi params", SECTION.format("DeleteParam"))
 def test_delete_param(client: Client, hand: Hand) -> None:
-    """delete_param takes a parameter away, where the node lets it."""
+    """delete_param removes a parameter, if the node allows it."""
     hand.do("declare", "conformance.fleeting", "0.5")
     name = f"{NODE}:conformance.fleeting"
     assert client.values("/rosapi/has_param", {"name": name})["exists"] is True
@@ -348,12 +348,12 @@ def test_get_param_names(client: Client) -> None:
     assert {f"{NODE}:conformance.number", f"{NODE}:use_sim_time"} <= set(names)
 
 
-# --- the rest ---
+# --- time, version and errors ---
 
 
 @case("rosapi rest", SECTION.format("GetTime"))
 def test_get_time(client: Client) -> None:
-    """get_time tells the present time."""
+    """get_time returns the present time."""
     now = client.values("/rosapi/get_time")["time"]
     assert abs(now["sec"] - time.time()) < 86_400
     assert 0 <= now["nanosec"] < 10**9
@@ -361,7 +361,7 @@ def test_get_time(client: Client) -> None:
 
 @case("rosapi rest", SECTION.format("GetROSVersion"))
 def test_get_ros_version(client: Client) -> None:
-    """get_ros_version tells 2 and the distribution."""
+    """get_ros_version returns 2 and the distribution."""
     values = client.values("/rosapi/get_ros_version")
     assert values["version"] == 2
     assert values["distro"]
@@ -369,7 +369,7 @@ def test_get_ros_version(client: Client) -> None:
 
 @case("rosapi rest", "SPEC 1.2; a call is always answered")
 def test_wrong_questions(client: Client) -> None:
-    """Questions that make no sense are answered, and harm nobody."""
+    """Invalid requests are answered, and have no other effect."""
     for service in (
         "topic_type",
         "service_type",
@@ -385,5 +385,5 @@ def test_wrong_questions(client: Client) -> None:
 
 @case("rosapi rest", "SPEC 1.2; a call is always answered")
 def test_no_such_question(client: Client) -> None:
-    """A question rosapi does not have is answered with result false."""
+    """A request for a service that rosapi does not have is answered with result false."""
     assert client.call("/rosapi/meaning_of_life", {})["result"] is False

@@ -1,4 +1,6 @@
-"""Services: of the robot called by clients, of clients called from the graph and by other clients."""
+"""Services: those of the robot called by clients, those of clients called from the graph and by other
+clients.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +20,7 @@ CALL = "rosbridge v2, 3.3.8 Call Service"
 RESPONSE = "rosbridge v2, 3.3.9 Service Response"
 OFFER = "rosbridge v2, 3.3.6 Advertise Service"
 WITHDRAW = "rosbridge v2, 3.3.7 Unadvertise Service"
+VALUES_ARE_AN_OBJECT = "values must be an object, so the call is never answered (service_response.py)"
 
 
 # --- call_service ---
@@ -80,7 +83,9 @@ def test_call_defaults(client: Client) -> None:
 
 @case("call_service", "SPEC 1.2, names and types")
 def test_call_old_names(client: Client) -> None:
-    """A service without leading slash and a type written pkg/Name are taken; the answer has the name as written."""
+    """A service without leading slash and a type written pkg/Name are accepted; the answer has the name as
+    written.
+    """
     client.send(
         "call_service", id="old", service=INVERT.lstrip("/"), type="std_srvs/SetBool", args={"data": False}
     )
@@ -145,7 +150,7 @@ def test_call_timeout(client: Client) -> None:
 
 @case("call_service", "SPEC 1.2 call_service, timeout")
 def test_call_late_answer_is_no_second(client: Client) -> None:
-    """What a service says after the timeout is no second answer."""
+    """A response after the timeout causes no second answer."""
     client.send("call_service", id="late", service=SLOW, timeout=0.2)
     assert client.until("service_response", id="late")["result"] is False
     assert client.values(SLOW)["message"] == "at last"
@@ -164,7 +169,7 @@ def test_call_out_of_order(client: Client) -> None:
 @case("call_service", CALL)
 def test_call_many(client: Client) -> None:
     """Eight calls at once, again and again, are each answered once, each with its own values."""
-    # ROS 2 keeps ten requests of a service waiting (rmw_qos_profile_services_default).
+    # ROS 2 queues ten requests of a service (rmw_qos_profile_services_default).
     for round_ in range(5):
         ids = list(range(round_ * 8, round_ * 8 + 8))
         for number in ids:
@@ -186,14 +191,14 @@ def test_call_of_two_clients(client: Client, server: Server) -> None:
 
 @case("call_service", CALL)
 def test_call_nested(client: Client) -> None:
-    """Messages inside of the answer, and lists of them, come whole."""
+    """Nested messages of the answer, and lists of them, arrive complete."""
     answer = client.values("/conformance/fixture/get_parameters", {"names": ["conformance.number"]})
     assert answer["values"][0]["integer_value"] == 7
 
 
 @case("call_service", "SPEC 1.2, /relay/ping")
 def test_call_relay_ping(client: Client) -> None:
-    """The relay's own service /relay/ping is called like any other, with a way to the robot and back."""
+    """The relay's own service /relay/ping is called like any other, with a round trip to the robot."""
     assert client.values("/relay/ping", {"robot": True})["robot_rtt_ms"] >= 0
 
 
@@ -211,20 +216,20 @@ class Offer:
         assert hand.do("offered", self.name, "1") == ["1"], "the service is not in the robot's graph"
 
     def ask(self, data: bool = True) -> str:
-        """Have the robot call it; the id the outcome will have."""
+        """The robot calls it; returns the id of its result."""
         return self.hand.ask("call", self.name, SET_BOOL, json.dumps({"data": data}), str(self.hand.waits))
 
     def called(self, **like: Any) -> dict[str, Any]:
-        """The next call that comes to the client."""
+        """The next call sent to the client."""
         return dict(self.client.until("call_service", service=self.name, **like))
 
     def respond(self, call: dict[str, Any], message: str) -> None:
-        """Answer a call."""
+        """Answers a call."""
         values = {"success": True, "message": message}
         self.client.send("service_response", service=self.name, id=call["id"], result=True, values=values)
 
     def outcome(self, asked: str) -> dict[str, Any]:
-        """What the robot got."""
+        """The robot's result."""
         (answer,) = self.hand.answer(asked)
         return dict(json.loads(answer))
 
@@ -282,7 +287,7 @@ def test_offer_to_clients(offer: Offer, server: Server) -> None:
 
 @case("advertise_service", "SPEC 1.2 advertise_service, an answer from anybody else")
 def test_offer_answered_by_another(offer: Offer, server: Server) -> None:
-    """An answer from a client that was not asked is not accepted, whatever id it guesses."""
+    """An answer from a client that was not asked is not accepted, for any id."""
     asked = offer.ask()
     call = offer.called()
     with server.connect() as other:
@@ -294,19 +299,21 @@ def test_offer_answered_by_another(offer: Offer, server: Server) -> None:
 
 
 @case("advertise_service", "SPEC 1.2 advertise_service", suite=NO_STATUS)
-def test_offer_answer_nobody_waits_for(told: Client, hand: Hand) -> None:
-    """An answer nobody waits for is refused in words."""
-    offer = Offer(told, hand)
-    told.send("service_response", service=offer.name, id="never asked", result=True, values={"success": True})
-    assert told.until("status", level="error")["msg"]
+def test_answer_to_a_call_that_does_not_exist(reported: Client, hand: Hand) -> None:
+    """An answer without a call is refused with a reason."""
+    offer = Offer(reported, hand)
+    reported.send(
+        "service_response", service=offer.name, id="never asked", result=True, values={"success": True}
+    )
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("advertise_service", "SPEC 1.2 advertise_service, offered already", suite=NO_STATUS)
-def test_offer_taken_by_robot(told: Client) -> None:
+def test_offer_taken_by_robot(reported: Client) -> None:
     """A name the robot offers already is an error in words, and the robot's own service goes on."""
-    told.send("advertise_service", service=INVERT, type=SET_BOOL)
-    assert told.until("status", level="error")["msg"]
-    assert told.values(INVERT, {"data": False}) == INVERTED
+    reported.send("advertise_service", service=INVERT, type=SET_BOOL)
+    assert reported.until("status", level="error")["msg"]
+    assert reported.values(INVERT, {"data": False}) == INVERTED
 
 
 @case("advertise_service", "SPEC 1.2 advertise_service, offered already", suite=NO_STATUS)
@@ -322,13 +329,13 @@ def test_offer_taken_by_client(offer: Offer, server: Server) -> None:
 
 
 @case("advertise_service", OFFER, suite=NO_STATUS)
-def test_offer_unknown_type(told: Client) -> None:
+def test_offer_unknown_type(reported: Client) -> None:
     """A type that does not exist is an error in words."""
-    told.send("advertise_service", service=fresh_name("service"), type="std_srvs/srv/NoSuchThing")
-    assert told.until("status", level="error")["msg"]
+    reported.send("advertise_service", service=fresh_name("service"), type="std_srvs/srv/NoSuchThing")
+    assert reported.until("status", level="error")["msg"]
 
 
-@case("advertise_service", RESPONSE + ", result")
+@case("advertise_service", RESPONSE + ", result", suite=VALUES_ARE_AN_OBJECT)
 def test_offer_refuses(offer: Offer, server: Server) -> None:
     """A client that answers with result false makes the other client's call fail with its words."""
     with server.connect() as other:
@@ -407,7 +414,7 @@ def test_withdraw(offer: Offer) -> None:
 
 @case("unadvertise_service", WITHDRAW)
 def test_withdraw_and_offer_again(offer: Offer) -> None:
-    """What was taken back can be offered again."""
+    """A withdrawn service can be offered again."""
     offer.client.send("unadvertise_service", service=offer.name)
     assert offer.hand.do("offered", offer.name, "0") == ["0"]
     offer.client.send("advertise_service", service=offer.name, type=SET_BOOL)
@@ -419,7 +426,7 @@ def test_withdraw_and_offer_again(offer: Offer) -> None:
 
 @case("unadvertise_service", WITHDRAW)
 def test_withdraw_of_another(offer: Offer, server: Server) -> None:
-    """A client can't take another client's service back."""
+    """A client can't withdraw another client's service."""
     with server.connect() as other:
         other.send("unadvertise_service", service=offer.name)
         other.lives()
@@ -430,7 +437,7 @@ def test_withdraw_of_another(offer: Offer, server: Server) -> None:
 
 @case("unadvertise_service", WITHDRAW)
 def test_withdraw_unknown(client: Client) -> None:
-    """Taking back what was never offered harms nobody."""
+    """Withdrawing what was never offered has no effect."""
     client.send("unadvertise_service", service=fresh_name("service"))
     client.lives()
     client.none("service_response", ABSENCE / 3)

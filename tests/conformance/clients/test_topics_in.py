@@ -1,4 +1,4 @@
-"""Clients' messages on their way into the robot's graph: advertise, unadvertise, publish."""
+"""Clients' messages to the robot's graph: advertise, unadvertise, publish."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PUBLISH = "rosbridge v2, 3.3.3 Publish"
 
 
 def graph_knows(client: Client, topic: str, type_name: str) -> None:
-    """Wait until the server has seen a topic of the graph."""
+    """Waits until the server has seen a topic of the graph."""
     until = time.monotonic() + client.patience
     while client.values("/rosapi/topic_type", {"topic": topic})["type"] != type_name:
         assert time.monotonic() < until, f"the server does not see {topic}"
@@ -27,9 +27,9 @@ def graph_knows(client: Client, topic: str, type_name: str) -> None:
 
 
 def ready(client: Client, hand: Hand, topic: str, type_name: str, **fields: object) -> None:
-    """The robot listens to a topic, which the server knows, and the client has advertised it.
+    """The robot subscribes to a topic, which the server knows, and the client has advertised it.
 
-    A server that does not know yet who listens publishes the first messages to nobody.
+    A server that does not know the subscriber yet loses the first messages.
     """
     hand.listen(topic, type_name)
     graph_knows(client, topic, type_name)
@@ -38,7 +38,7 @@ def ready(client: Client, hand: Hand, topic: str, type_name: str, **fields: obje
 
 
 def published(client: Client, hand: Hand, topic: str, type_name: str, message: object) -> dict:
-    """What the robot hears of a message; said again, since the two ends may learn of each other only by and by."""
+    """The message that the robot receives; published repeatedly until both sides have discovered each other."""
     ready(client, hand, topic, type_name)
     until = time.monotonic() + client.patience
     while True:
@@ -49,11 +49,11 @@ def published(client: Client, hand: Hand, topic: str, type_name: str, message: o
         assert time.monotonic() < until, f"the robot heard nothing on {topic}"
 
 
-def refused(told: Client, hand: Hand, topic: str, type_name: str, message: object) -> str:
-    """The words a message is refused with, after proving that the robot heard nothing of it."""
-    ready(told, hand, topic, type_name)
-    told.send("publish", topic=topic, msg=message, id="bad")
-    words = told.until("status", level="error")["msg"]
+def refused(reported: Client, hand: Hand, topic: str, type_name: str, message: object) -> str:
+    """The error of a refused message, after a check that the robot received nothing of it."""
+    ready(reported, hand, topic, type_name)
+    reported.send("publish", topic=topic, msg=message, id="bad")
+    words = reported.until("status", level="error")["msg"]
     assert hand.do("heard", topic, "1", str(ABSENCE)) == []
     return words
 
@@ -76,18 +76,18 @@ def test_advertise_publish(client: Client, hand: Hand, topic: str) -> None:
 
 @case("advertise", ADVERTISE)
 def test_advertise_old_names(client: Client, hand: Hand, topic: str) -> None:
-    """A topic without leading slash and a type written pkg/Name are taken."""
+    """A topic without leading slash and a type written pkg/Name are accepted."""
     client.send("advertise", topic=topic.lstrip("/"), type="std_msgs/String")
     assert hand.publishers(topic, 1)[0]["type"] == STRING
 
 
 @case("advertise", ADVERTISE, suite=NO_STATUS)
-def test_advertise_type_conflict(told: Client, hand: Hand, topic: str) -> None:
+def test_advertise_type_conflict(reported: Client, hand: Hand, topic: str) -> None:
     """Advertising a topic with another type than it has is an error in words."""
     hand.topic(topic, STRING)
-    graph_knows(told, topic, STRING)
-    told.send("advertise", topic=topic, type="std_msgs/msg/Int32", id="conflict")
-    assert told.until("status", level="error")["msg"]
+    graph_knows(reported, topic, STRING)
+    reported.send("advertise", topic=topic, type="std_msgs/msg/Int32", id="conflict")
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("advertise", ADVERTISE)
@@ -101,15 +101,15 @@ def test_advertise_type_conflict_makes_no_publisher(client: Client, hand: Hand, 
 
 
 @case("advertise", ADVERTISE, suite=NO_STATUS)
-def test_advertise_unknown_type(told: Client, topic: str) -> None:
+def test_advertise_unknown_type(reported: Client, topic: str) -> None:
     """Advertising a type that does not exist is an error in words."""
-    told.send("advertise", topic=topic, type="std_msgs/msg/NoSuchThing")
-    assert told.until("status", level="error")["msg"]
+    reported.send("advertise", topic=topic, type="std_msgs/msg/NoSuchThing")
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("advertise", ADVERTISE)
 def test_advertise_nonsense_lives(client: Client, topic: str) -> None:
-    """Advertising with types that are none harms nobody."""
+    """Advertising with invalid types has no other effect."""
     for type_name in ("std_msgs/msg/NoSuchThing", "no_such_package/msg/Thing", "", "String", "a/b/c/d"):
         client.send("advertise", topic=topic, type=type_name)
     client.lives()
@@ -117,7 +117,7 @@ def test_advertise_nonsense_lives(client: Client, topic: str) -> None:
 
 @case("advertise", "rosbridge v2, 4.3 Latching; SPEC 1.2 advertise")
 def test_advertise_latch(client: Client, hand: Hand, topic: str) -> None:
-    """With latch, who joins late gets the last message."""
+    """With latch, a late subscriber gets the last message."""
     client.send("advertise", topic=topic, type=STRING, latch=True)
     assert hand.publishers(topic, 1)[0]["durability"] == "transient_local"
     for text in ("first", "last"):
@@ -151,10 +151,10 @@ def test_advertise_times(client: Client, hand: Hand, topic: str) -> None:
 
 
 @case("advertise", "SPEC 1.2 advertise, qos", suite=NO_STATUS)
-def test_advertise_bad_qos(told: Client, topic: str) -> None:
+def test_advertise_bad_qos(reported: Client, topic: str) -> None:
     """A qos with a value that doesn't exist is an error in words."""
-    told.send("advertise", topic=topic, type=STRING, qos={"reliability": "sometimes"})
-    assert told.until("status", level="error")["msg"]
+    reported.send("advertise", topic=topic, type=STRING, qos={"reliability": "sometimes"})
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("advertise", "SPEC 1.2 advertise, queue_size")
@@ -168,28 +168,28 @@ def test_advertise_queue_size(client: Client, hand: Hand, topic: str) -> None:
 
 @case("advertise", "SPEC 1.2 advertise, queue_size")
 def test_advertise_queue_size_negative(client: Client, hand: Hand, topic: str) -> None:
-    """A queue_size below one is taken as left out: what is published arrives."""
+    """A queue_size below one counts as left out: what is published arrives."""
     ready(client, hand, topic, STRING, queue_size=-5)
     client.send("publish", topic=topic, msg={"data": "here"})
     assert hand.heard(topic, 1) == [{"data": "here"}]
 
 
 @case("advertise", "SPEC 1.2 advertise, the first one's latch and qos stay", suite=NO_STATUS)
-def test_advertise_other_latch(told: Client, server: Server, hand: Hand, topic: str) -> None:
-    """Who advertises a topic with another latch than the first one is warned, with the id."""
+def test_advertise_other_latch(reported: Client, server: Server, hand: Hand, topic: str) -> None:
+    """A client that advertises a topic with another latch than the first one gets a warning with the id."""
     with server.connect() as first:
         ready(first, hand, topic, STRING)
-        told.send("set_level", level="warning")
-        told.send("advertise", topic=topic, type=STRING, latch=True, id="other")
-        assert told.until("status", level="warning", id="other")["msg"]
+        reported.send("set_level", level="warning")
+        reported.send("advertise", topic=topic, type=STRING, latch=True, id="other")
+        assert reported.until("status", level="warning", id="other")["msg"]
         assert hand.publishers(topic, 1)[0]["durability"] == "volatile"
 
 
 @case("advertise", "SPEC 1.2 advertise, told once with its id", suite=NO_STATUS)
-def test_advertise_failure_names_the_id(told: Client, topic: str) -> None:
-    """A type that is not to be had is an error with the id of its advertise."""
-    told.send("advertise", topic=topic, type="no_such_package/msg/Thing", id="which")
-    assert told.until("status", level="error", id="which")["msg"]
+def test_advertise_failure_names_the_id(reported: Client, topic: str) -> None:
+    """A type that is not available is an error with the id of its advertise."""
+    reported.send("advertise", topic=topic, type="no_such_package/msg/Thing", id="which")
+    assert reported.until("status", level="error", id="which")["msg"]
 
 
 # --- unadvertise ---
@@ -239,7 +239,7 @@ def test_unadvertise_other_client(client: Client, server: Server, hand: Hand, to
 
 @case("unadvertise", UNADVERTISE, suite=LATE)
 def test_unadvertise_by_leaving(server: Server, hand: Hand, topic: str) -> None:
-    """A client that leaves takes its publishers along."""
+    """A client that leaves ends its publishers."""
     with server.connect() as leaving:
         ready(leaving, hand, topic, STRING)
     hand.publishers(topic, 0)
@@ -247,18 +247,18 @@ def test_unadvertise_by_leaving(server: Server, hand: Hand, topic: str) -> None:
 
 @case("unadvertise", UNADVERTISE)
 def test_unadvertise_unknown(client: Client, topic: str) -> None:
-    """Unadvertising what was never advertised harms nobody."""
+    """Unadvertising what was never advertised has no other effect."""
     client.send("unadvertise", topic=topic)
     client.send("unadvertise", topic=topic, id="never")
     client.lives()
 
 
 @case("unadvertise", UNADVERTISE, suite=NO_STATUS)
-def test_unadvertise_unknown_is_warned_of(told: Client, topic: str) -> None:
+def test_unadvertise_unknown_is_warned_of(reported: Client, topic: str) -> None:
     """Unadvertising what was never advertised is a warning in words."""
-    told.send("set_level", level="warning")
-    told.send("unadvertise", topic=topic, id="never")
-    assert told.until("status", level="warning", id="never")["msg"]
+    reported.send("set_level", level="warning")
+    reported.send("unadvertise", topic=topic, id="never")
+    assert reported.until("status", level="warning", id="never")["msg"]
 
 
 # --- publish ---
@@ -269,7 +269,7 @@ def test_publish_infers(client: Client, hand: Hand, topic: str) -> None:
     """Publishing without advertise takes the type from the graph."""
     hand.listen(topic, STRING)
     graph_knows(client, topic, STRING)
-    # rosbridge does not promise that the first one arrives: the publisher has to be found.
+    # rosbridge does not guarantee that the first one arrives: the publisher has to be discovered.
     until = time.monotonic() + client.patience
     while not hand.do("heard", topic, "1", "0.1"):
         assert time.monotonic() < until, "nothing arrived"
@@ -278,10 +278,10 @@ def test_publish_infers(client: Client, hand: Hand, topic: str) -> None:
 
 
 @case("publish", PUBLISH, suite=NO_STATUS)
-def test_publish_unknown_topic(told: Client, topic: str) -> None:
-    """Publishing on a topic nobody knows is an error in words."""
-    told.send("publish", topic=topic, msg={"data": "where to?"})
-    assert told.until("status", level="error")["msg"]
+def test_publish_unknown_topic(reported: Client, topic: str) -> None:
+    """Publishing on an unknown topic is an error in words."""
+    reported.send("publish", topic=topic, msg={"data": "where to?"})
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("publish", "SPEC 1.2 publish, type")
@@ -293,7 +293,7 @@ def test_publish_with_type(client: Client, hand: Hand, topic: str) -> None:
 
 @case("publish", "SPEC 1.2 publish, latch and qos without advertise")
 def test_publish_latch_without_advertise(client: Client, hand: Hand, topic: str) -> None:
-    """A first message with latch makes a latching publisher: who joins late gets it."""
+    """A first message with latch makes a latching publisher: a late subscriber gets it."""
     client.send("publish", topic=topic, type=STRING, msg={"data": "kept"}, latch=True)
     assert hand.publishers(topic, 1)[0]["durability"] == "transient_local"
     client.lives()
@@ -334,7 +334,7 @@ def test_publish_stamp_now(client: Client, hand: Hand, topic: str) -> None:
 
 @case("publish", PUBLISH)
 def test_publish_stamp_given(client: Client, hand: Hand, topic: str) -> None:
-    """A stamp that is given is kept."""
+    """A given stamp is kept."""
     message = {"header": {"stamp": {"sec": 12, "nanosec": 34}}}
     header = published(client, hand, topic, "geometry_msgs/msg/Vector3Stamped", message)["header"]
     assert header["stamp"] == {"sec": 12, "nanosec": 34}
@@ -342,7 +342,7 @@ def test_publish_stamp_given(client: Client, hand: Hand, topic: str) -> None:
 
 @case("publish", "SPEC 4, secs and nsecs")
 def test_publish_stamp_ros1(client: Client, hand: Hand, topic: str) -> None:
-    """secs and nsecs of older clients are taken for sec and nanosec."""
+    """secs and nsecs of older clients count as sec and nanosec."""
     message = {"header": {"stamp": {"secs": 12, "nsecs": 34}}}
     header = published(client, hand, topic, "geometry_msgs/msg/Vector3Stamped", message)["header"]
     assert header["stamp"] == {"sec": 12, "nanosec": 34}
@@ -389,7 +389,7 @@ def test_publish_64_bits(client: Client, hand: Hand, topic: str) -> None:
 
 @case("publish", PUBLISH)
 def test_publish_int_for_float(client: Client, hand: Hand, topic: str) -> None:
-    """An integer is taken for a float, as JavaScript writes 1.0 as 1."""
+    """An integer is accepted for a float, as JavaScript writes 1.0 as 1."""
     assert published(client, hand, topic, "std_msgs/msg/Float64", {"data": 3}) == {"data": 3.0}
 
 
@@ -420,27 +420,27 @@ def test_publish_nested(client: Client, hand: Hand, topic: str) -> None:
 
 
 @case("publish", PUBLISH, suite=NO_STATUS)
-def test_publish_wrong_type(told: Client, hand: Hand, topic: str) -> None:
+def test_publish_wrong_type(reported: Client, hand: Hand, topic: str) -> None:
     """A field of the wrong type is refused in words, and nothing is published."""
-    assert "data" in refused(told, hand, topic, "std_msgs/msg/Int32", {"data": "seven"})
+    assert "data" in refused(reported, hand, topic, "std_msgs/msg/Int32", {"data": "seven"})
 
 
 @case("publish", PUBLISH, suite=NO_STATUS)
-def test_publish_unknown_field(told: Client, hand: Hand, topic: str) -> None:
+def test_publish_unknown_field(reported: Client, hand: Hand, topic: str) -> None:
     """A field the type does not have is refused in words, and nothing is published."""
-    assert "colour" in refused(told, hand, topic, STRING, {"data": "x", "colour": "red"})
+    assert "colour" in refused(reported, hand, topic, STRING, {"data": "x", "colour": "red"})
 
 
 @case("publish", "SPEC 4, numbers out of range", suite=NO_STATUS)
-def test_publish_out_of_range(told: Client, hand: Hand, topic: str) -> None:
+def test_publish_out_of_range(reported: Client, hand: Hand, topic: str) -> None:
     """A number out of the field's range is refused in words, and nothing is published."""
-    assert "data" in refused(told, hand, topic, "std_msgs/msg/UInt8", {"data": 256})
+    assert "data" in refused(reported, hand, topic, "std_msgs/msg/UInt8", {"data": 256})
 
 
 @case("publish", "SPEC 4, an error names the path", suite=NO_STATUS)
-def test_publish_names_the_path(told: Client, hand: Hand, topic: str) -> None:
-    """The refusal of a wrong value names where it is."""
-    words = refused(told, hand, topic, "geometry_msgs/msg/Pose", {"position": {"x": "left"}})
+def test_publish_names_the_path(reported: Client, hand: Hand, topic: str) -> None:
+    """The refusal of a wrong value names its path."""
+    words = refused(reported, hand, topic, "geometry_msgs/msg/Pose", {"position": {"x": "left"}})
     assert "position.x" in words
 
 
@@ -458,7 +458,7 @@ def test_publish_wrong_then_right(client: Client, hand: Hand, topic: str) -> Non
 
 @case("publish", PUBLISH)
 def test_publish_order(client: Client, hand: Hand) -> None:
-    """Through the robot and back messages keep their order."""
+    """Messages to the robot and back keep their order."""
     client.send("subscribe", topic="/conformance/echo/out", type=STRING)
     client.send("advertise", topic="/conformance/echo/in", type=STRING)
     until = time.monotonic() + client.patience
@@ -477,7 +477,7 @@ def test_publish_order(client: Client, hand: Hand) -> None:
 @case("publish", "SPEC 2.5 Clocks and deadline")
 def test_publish_motion(client: Client, hand: Hand, topic: str) -> None:
     """Commands to a motion topic, sent again and again, arrive."""
-    # Not by the number of publishers: a robot may have one of its own there, to stop it.
+    # Not by the number of publishers: a robot may have its own one there, to stop it.
     hand.listen(topic, "geometry_msgs/msg/Twist")
     client.send("advertise", topic=topic, type="geometry_msgs/msg/Twist")
     until = time.monotonic() + client.patience

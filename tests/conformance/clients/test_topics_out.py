@@ -1,4 +1,4 @@
-"""Samples on their way from the robot's graph to clients: subscribe, unsubscribe."""
+"""Samples from the robot's graph to clients: subscribe, unsubscribe."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ STRING = "std_msgs/msg/String"
 INT = "std_msgs/msg/Int64"
 COUNTER = "/conformance/counter"
 THROTTLE_DROPS = "what comes within the throttle is dropped, the last too (subscription_modifiers.py)"
+FIRST_TWICE = (
+    "after a client's second subscription the next sample comes twice (subscribers.py, _new_sub_callback)"
+)
 SUBSCRIBE = "rosbridge v2, 3.3.4 Subscribe"
 UNSUBSCRIBE = "rosbridge v2, 3.3.5 Unsubscribe"
 ENCODING = "rosbridge v2, 4.6 Data Type Encoding"
 
 
 def seen(client: Client, hand: Hand, topic: str, type_name: str, message: object) -> dict:
-    """What a subscriber gets of a message the robot publishes."""
+    """What a subscriber gets of a message that the robot publishes."""
     hand.topic(topic, type_name)
     client.send("subscribe", topic=topic, type=type_name)
     hand.publish(topic, message)
@@ -73,22 +76,22 @@ def test_subscribe_pending(client: Client, hand: Hand, topic: str) -> None:
 
 
 @case("subscribe", SUBSCRIBE, suite=NO_STATUS)
-def test_subscribe_nothing_known(told: Client, topic: str) -> None:
+def test_subscribe_nothing_known(reported: Client, topic: str) -> None:
     """Subscribing to what does not exist without a type is an error in words."""
-    told.send("subscribe", topic=topic)
-    assert told.until("status", level="error")["msg"]
+    reported.send("subscribe", topic=topic)
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("subscribe", SUBSCRIBE, suite=NO_STATUS)
-def test_subscribe_type_mismatch(told: Client) -> None:
+def test_subscribe_type_mismatch(reported: Client) -> None:
     """Subscribing with another type than the topic has is an error in words."""
-    told.send("subscribe", topic=COUNTER, type=STRING)
-    assert told.until("status", level="error")["msg"]
+    reported.send("subscribe", topic=COUNTER, type=STRING)
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("subscribe", SUBSCRIBE)
 def test_subscribe_type_mismatch_lives(client: Client) -> None:
-    """Subscribing with another type than the topic has gives no samples, and harms nobody."""
+    """Subscribing with another type than the topic has gives no samples, and has no other effect."""
     client.send("subscribe", topic=COUNTER, type=STRING)
     client.none("publish", topic=COUNTER)
     client.lives()
@@ -108,18 +111,18 @@ def test_subscribe_both_names(client: Client, hand: Hand, topic: str) -> None:
 
 
 @case("subscribe", "SPEC 1.2 subscribe, with another type", suite=NO_STATUS)
-def test_subscribe_pending_other_type(told: Client, hand: Hand, topic: str) -> None:
-    """Who waits for a topic that appears with another type is told, and gets nothing."""
-    told.send("subscribe", topic=topic, type="std_msgs/msg/Int32")
-    told.lives()
+def test_subscribe_pending_other_type(reported: Client, hand: Hand, topic: str) -> None:
+    """A subscriber whose topic appears with another type gets an error and no samples."""
+    reported.send("subscribe", topic=topic, type="std_msgs/msg/Int32")
+    reported.lives()
     hand.topic(topic, STRING)
-    assert told.until("status", level="error")["msg"]
-    told.none("publish")
+    assert reported.until("status", level="error")["msg"]
+    reported.none("publish")
 
 
 @case("subscribe", SUBSCRIBE)
 def test_subscribe_comes_back(client: Client, hand: Hand, topic: str) -> None:
-    """A topic that vanishes and appears again goes on."""
+    """A topic that ends and appears again continues."""
     assert seen(client, hand, topic, STRING, {"data": "before"}) == {"data": "before"}
     hand.vanish(topic)
     hand.topic(topic, STRING)
@@ -146,7 +149,9 @@ def test_subscribe_last_of_burst(client: Client, hand: Hand, topic: str) -> None
 
 @case("subscribe", "rosbridge v2, 3.3.4 Subscribe, queue_length")
 def test_subscribe_queue(client: Client, hand: Hand, topic: str) -> None:
-    """With throttle_rate and queue_length, what comes within the throttle is queued and sent, the oldest give way."""
+    """With throttle_rate and queue_length, samples within the throttle are queued and sent; the oldest are
+    dropped.
+    """
     hand.topic(topic, INT)
     client.send("subscribe", topic=topic, type=INT, throttle_rate=200, queue_length=5)
     client.lives()
@@ -158,7 +163,7 @@ def test_subscribe_queue(client: Client, hand: Hand, topic: str) -> None:
     assert numbers[-5:] == [5, 6, 7, 8, 9]
 
 
-@case("subscribe", SUBSCRIBE + ", several subscriptions")
+@case("subscribe", SUBSCRIBE + ", several subscriptions", suite=FIRST_TWICE)
 def test_subscribe_least_throttle(client: Client) -> None:
     """Of several subscriptions of one client the least throttle_rate counts, and samples come once."""
     client.send("subscribe", topic=COUNTER, type=INT, id="slow", throttle_rate=60_000)
@@ -182,7 +187,7 @@ def test_subscribe_throttle_remains(client: Client) -> None:
 
 @case("subscribe", "rosbridge v2, 4.3 Latching; SPEC 1.2 subscribe")
 def test_subscribe_latched(server: Server) -> None:
-    """Everybody who subscribes to a latched topic gets its last sample, not only the first."""
+    """Every subscriber of a latched topic gets its last sample, not only the first."""
     with server.connect() as first, server.connect() as second:
         for each in (first, second):
             each.send("subscribe", topic="/conformance/latched", type=STRING)
@@ -218,10 +223,10 @@ def test_subscribe_best_effort(client: Client, hand: Hand, topic: str) -> None:
 
 
 @case("subscribe", "SPEC 1.2 subscribe, qos", suite=NO_STATUS)
-def test_subscribe_bad_qos(told: Client, topic: str) -> None:
+def test_subscribe_bad_qos(reported: Client, topic: str) -> None:
     """A qos with a value that doesn't exist is an error in words."""
-    told.send("subscribe", topic=topic, type=STRING, qos={"durability": "eternal"})
-    assert told.until("status", level="error")["msg"]
+    reported.send("subscribe", topic=topic, type=STRING, qos={"durability": "eternal"})
+    assert reported.until("status", level="error")["msg"]
 
 
 @case("subscribe", "RFC 8259, 6 Numbers; SPEC 4")
@@ -294,11 +299,11 @@ def test_subscribe_three_clients(server: Server, hand: Hand, topic: str) -> None
 
 
 @case("subscribe", "SPEC 1.2 subscribe, compression", suite=NO_STATUS)
-def test_subscribe_unknown_compression(told: Client) -> None:
-    """A compression nobody knows is told as an error and counts as none."""
-    told.send("subscribe", topic=COUNTER, type=INT, compression="zip")
-    assert told.until("status", level="error")["msg"]
-    assert isinstance(told.until("publish")["msg"]["data"], int)
+def test_subscribe_unknown_compression(reported: Client) -> None:
+    """An unknown compression is an error and counts as none."""
+    reported.send("subscribe", topic=COUNTER, type=INT, compression="zip")
+    assert reported.until("status", level="error")["msg"]
+    assert isinstance(reported.until("publish")["msg"]["data"], int)
 
 
 @case("subscribe", "SPEC 1.2, /relay/status")
@@ -364,7 +369,7 @@ def test_unsubscribe_other_client(server: Server, client: Client) -> None:
 
 @case("unsubscribe", "SPEC 1.2 unsubscribe")
 def test_unsubscribe_frees_the_robot(client: Client, hand: Hand, topic: str) -> None:
-    """After the last client's end nobody listens on the robot any more."""
+    """After the last client's end the robot has no subscription any more."""
     seen(client, hand, topic, STRING, {"data": "x"})
     client.send("unsubscribe", topic=topic)
     assert hand.do("subscribers", topic, "0") == ["0"]
@@ -372,7 +377,7 @@ def test_unsubscribe_frees_the_robot(client: Client, hand: Hand, topic: str) -> 
 
 @case("unsubscribe", "SPEC 1.2 unsubscribe")
 def test_unsubscribe_by_leaving(server: Server, hand: Hand, topic: str) -> None:
-    """A client that leaves takes its subscriptions along."""
+    """A client that leaves ends its subscriptions."""
     with server.connect() as leaving:
         seen(leaving, hand, topic, STRING, {"data": "x"})
     assert hand.do("subscribers", topic, "0") == ["0"]
@@ -380,7 +385,7 @@ def test_unsubscribe_by_leaving(server: Server, hand: Hand, topic: str) -> None:
 
 @case("unsubscribe", UNSUBSCRIBE)
 def test_unsubscribe_unknown(client: Client, topic: str) -> None:
-    """Ending what was never subscribed harms nobody."""
+    """Ending what was never subscribed has no effect."""
     client.send("unsubscribe", topic=topic)
     client.send("unsubscribe", topic=topic, id="never")
     client.lives()
@@ -388,7 +393,7 @@ def test_unsubscribe_unknown(client: Client, topic: str) -> None:
 
 @case("unsubscribe", UNSUBSCRIBE)
 def test_unsubscribe_and_again(client: Client, hand: Hand, topic: str) -> None:
-    """What was unsubscribed can be subscribed again."""
+    """A topic can be subscribed again after unsubscribe."""
     assert seen(client, hand, topic, STRING, {"data": "one"})
     client.send("unsubscribe", topic=topic)
     client.lives()

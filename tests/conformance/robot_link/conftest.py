@@ -1,4 +1,4 @@
-"""The robot under test: one that dials in with ``--listen``, else our own ones."""
+"""The robot under test: one that connects with ``--listen``, otherwise the project's own ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture
 def channel(relay: LinkRelay) -> Iterator[Link]:
-    """A channel link of its own for each case."""
+    """A new channel link for each case."""
     with relay.channel() as link:
         yield link
 
@@ -36,7 +36,7 @@ def drive(relay: LinkRelay) -> Iterator[Wheels]:
 
 @pytest.fixture(scope="session")
 def relay(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LinkRelay]:
-    """A relay of the suite's own with the robot enrolled and registered."""
+    """A relay of the suite with the robot enrolled and registered."""
     listen = request.config.getoption("--listen", "")
     if listen:
         yield from _dialled(request.config, listen)
@@ -75,7 +75,7 @@ def _dialled(config: pytest.Config, listen: str) -> Iterator[LinkRelay]:
 
 
 def _wait_for_graph(made: LinkRelay) -> None:
-    """A daemon may know little of its graph at first; give it some seconds to find out."""
+    """A daemon may know little of its graph at first; waits some seconds."""
     assert made.control
     made.facts()
     until = time.monotonic() + 5

@@ -1,4 +1,4 @@
-"""Enrolment, opening, pings, and what a robot tells of itself on its control link."""
+"""Enrolment, opening, pings, and the robot's description on its control link."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_hello(relay: LinkRelay) -> None:
 
 @case("prove", "SPEC 2.2 prove; RFC 8032")
 def test_prove(relay: LinkRelay) -> None:
-    """The signature fits context, relay, robot and nonce; without that no case would have come so far."""
+    """The signature fits context, relay, robot and nonce; otherwise no case would have come so far."""
     assert not relay.control.ended
 
 
@@ -66,7 +66,7 @@ def test_robot_pings(relay: LinkRelay, channel: Link) -> None:
 
 @case("frames", "SPEC 2.1 Frames")
 def test_frames_in_pieces(relay: LinkRelay) -> None:
-    """A frame that comes byte by byte is understood, and two that come in one piece."""
+    """A frame that comes byte by byte is understood, and so are two in one piece."""
     for byte in message("ping", t=11):
         relay.control.raw(bytes([byte]))
     relay.control.raw(message("ping", t=12) + message("ping", t=13))
@@ -76,7 +76,7 @@ def test_frames_in_pieces(relay: LinkRelay) -> None:
 
 @case("frames", "SPEC 2.2, unknown fields")
 def test_unknown_fields(relay: LinkRelay, channel: Link) -> None:
-    """Unknown fields are passed over, on both links."""
+    """Unknown fields are ignored, on both links."""
     relay.control.say("ping", t=21, **STRANGE)
     relay.control.expect("pong", t=21)
     assert subscribe(channel, relay, **STRANGE)
@@ -122,7 +122,7 @@ def test_two_channels(relay: LinkRelay) -> None:
 
 @case("open_channel", "SPEC 2.4 open_channel")
 def test_next_channel(relay: LinkRelay) -> None:
-    """A channel that is opened before the last one is closed is served, whatever becomes of the last one."""
+    """A channel that is opened before the last one is closed is served, for any end of the last one."""
     control = relay.control
     with relay.channel() as last:
         assert subscribe(last, relay)

@@ -1,4 +1,4 @@
-"""Services, types and actions, on both ends."""
+"""Services, types and actions, in both directions."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def test_offer_service(relay: LinkRelay) -> None:
         assert asked["type"] == TRIGGER
         answer = base64.b64encode(CDR + b"\1\0\0\0" + struct.pack("<I", 5) + b"here\0").decode()
         offering.say("service_response", id=asked["id"], result=True, cdr=answer)
-        told = calling.expect("service_response", id="mine")
-        assert told["result"] is True
-        assert b"here" in base64.b64decode(told["cdr"])
+        reported = calling.expect("service_response", id="mine")
+        assert reported["result"] is True
+        assert b"here" in base64.b64decode(reported["cdr"])
         offering.say("unadvertise_service", service=name)
         calling.say("call_service", id="gone", service=name, type=TRIGGER, timeout=0.5, **request)
         assert calling.expect("service_response", id="gone")["result"] is False
@@ -65,8 +65,8 @@ def test_get_type(relay: LinkRelay, channel: Link) -> None:
     if "cdr" not in relay.hello["encodings"]:
         not_offered("encodings json only: nobody needs its types")
     channel.say("get_type", type=TWIST)
-    told = channel.expect("type_definition", type=TWIST)
-    main, _, rest = told["text"].partition("\n" + "=" * 80 + "\n")
+    reported = channel.expect("type_definition", type=TWIST)
+    main, _, rest = reported["text"].partition("\n" + "=" * 80 + "\n")
     assert "Vector3" in main
     assert rest.startswith(("MSG: geometry_msgs/msg/Vector3", "MSG: geometry_msgs/Vector3"))
     assert "float64 x" in rest
@@ -77,7 +77,7 @@ def test_get_type_unknown(channel: Link) -> None:
     """A type that does not exist is answered by failed: what, ref, and a reason."""
     channel.say("get_type", type="no_such_package/msg/Thing")
     failed = channel.expect("failed")
-    assert (failed["what"], failed["ref"]) == ("get_type", "no_such_package/msg/Thing")
+    assert (failed["request"], failed["reference"]) == ("get_type", "no_such_package/msg/Thing")
     assert failed["reason"]
 
 
@@ -88,7 +88,7 @@ def test_get_interfaces(channel: Link) -> None:
     until = time.monotonic() + 8
     while time.monotonic() < until:
         with contextlib.suppress(AssertionError):
-            channel.expect("failed", 0.1, what="get_interfaces")
+            channel.expect("failed", 0.1, request="get_interfaces")
             not_offered("the names of its types")
         with contextlib.suppress(AssertionError):
             types = channel.expect("interfaces", 0.1)["types"]
@@ -115,7 +115,7 @@ def test_goal_unknown(channel: Link) -> None:
 
 @case("advertise_action", "SPEC 2.5 advertise_action")
 def test_offer_action(relay: LinkRelay) -> None:
-    """An action the relay offers is pursued from the robot's graph, here by another channel, to its result."""
+    """An action the relay offers is used from the robot's graph, here by another channel, up to its result."""
     name = f"/conformance_offer_{time.monotonic_ns()}"
     with relay.channel() as offering, relay.channel() as asking:
         offering.say("advertise_action", action=name, type=FIBONACCI, source="a case")
@@ -157,7 +157,7 @@ def test_cancel(relay: LinkRelay, channel: Link) -> None:
 
 @case("cancel_action_goal", "SPEC 2.5 cancel_action_goal")
 def test_cancel_unknown(channel: Link) -> None:
-    """Cancelling a goal nobody knows harms nobody."""
+    """Cancelling an unknown goal has no effect."""
     channel.say("cancel_action_goal", id="never")
     channel.say("ping", t=1)
     channel.expect("pong", t=1)

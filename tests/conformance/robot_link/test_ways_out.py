@@ -1,4 +1,4 @@
-"""How a link ends, and how the robot comes back. Each case costs it its link."""
+"""The end of a link, and the robot's reconnection. Each case costs the robot its link."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 
 import pytest
 from conformance_suite import case
-from link_relay import COMMAND_FRAME, HEARTBEAT, JSON, RARE, Link, LinkRelay, frame, message
+from link_relay import HEARTBEAT, JSON, RARE, RELAY_JSON_FRAME, Link, LinkRelay, frame, message
 from robot_tasks import subscribe
 
 
@@ -23,7 +23,7 @@ def test_bye(relay: LinkRelay) -> None:
 
 @case("reconnect", "SPEC 2.3, dials again, for ever")
 def test_cut(relay: LinkRelay) -> None:
-    """After the link was cut the robot dials again, proves itself anew, and tells all of itself again."""
+    """After the link was cut the robot connects again, proves its key again, and sends its description again."""
     relay.control.cut()
     assert not relay.control.ended
     assert relay.first_graph is not None
@@ -34,7 +34,7 @@ def test_cut(relay: LinkRelay) -> None:
 
 @case("reconnect", "SPEC 2.3, nothing for three heartbeats")
 def test_silent_relay(relay: LinkRelay) -> None:
-    """A relay that is silent for three heartbeats is left, and dialled again."""
+    """A relay that is silent for three heartbeats is disconnected, and dialled again."""
     link = relay.control_with(HEARTBEAT)
     link.answers_pings = False
     link.wait_end()
@@ -64,15 +64,15 @@ def test_refused(relay: LinkRelay) -> None:
 
 
 def breaks(link: Link, data: bytes, seconds: float = 8.0) -> None:
-    """After these bytes the robot says so, or says nothing, and hangs up, earlier than for silence."""
+    """After these bytes the robot sends an error or nothing, and disconnects earlier than after silence."""
     link.raw(data)
     link.wait_end(seconds)
 
 
 @case("frames", "SPEC 2.1, a length over the limit")
 def test_oversized_frame(relay: LinkRelay) -> None:
-    """A frame over 4 MiB is refused when its length is there, and the robot dials again."""
-    breaks(relay.control_with(RARE), struct.pack("!IB", COMMAND_FRAME + 1, JSON))
+    """A frame over 4 MiB is refused by its length, and the robot dials again."""
+    breaks(relay.control_with(RARE), struct.pack("!IB", RELAY_JSON_FRAME + 1, JSON))
     assert not relay.control.ended
 
 
@@ -81,7 +81,7 @@ def test_oversized_before_proof(relay: LinkRelay) -> None:
     """Before the proof a frame over 16 KiB is refused."""
     relay.control.cut()
     link, _ = relay.dialled("hello", relay.patience)
-    # Before it is told another heartbeat, a robot waits 6 s in silence.
+    # Before it gets another heartbeat, a robot waits for 6 s of silence.
     breaks(link, struct.pack("!IB", 16 * 1024 + 1, JSON), 4)
     assert not relay.control.ended
 
@@ -93,7 +93,7 @@ def test_oversized_before_proof(relay: LinkRelay) -> None:
     ids=["length 0", "unknown kind", "no JSON", "no object", "a sample on the control link"],
 )
 def test_broken_frames(relay: LinkRelay, data: bytes) -> None:
-    """What breaks the contract ends the link, and the robot dials again."""
+    """A violation of the contract ends the link, and the robot dials again."""
     breaks(relay.control_with(RARE), data + b"\0\0")
     assert not relay.control.ended
 
@@ -107,7 +107,7 @@ def test_unknown_op(relay: LinkRelay) -> None:
 
 @case("frames", "SPEC 2.2, an unknown op")
 def test_unknown_op_on_channel(relay: LinkRelay) -> None:
-    """An unknown op on a channel link is told in words or ends it; the control link lives."""
+    """An unknown op on a channel link gets an error or ends it; the control link lives."""
     control = relay.control
     with relay.channel() as link:
         link.say("make_coffee")

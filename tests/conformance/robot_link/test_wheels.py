@@ -1,4 +1,4 @@
-"""What moves: fresh commands only, and a standstill whatever is lost."""
+"""Motion: only fresh commands, and a standstill after any loss."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ LATE = 0.75
 
 @case("motion", "SPEC 2.5 advertised, motion")
 def test_motion_is_known(drive: Wheels) -> None:
-    """The robot says of the topic that it moves it."""
-    assert drive.told["motion"] is True
+    """The robot reports that the topic moves it."""
+    assert drive.reported["motion"] is True
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 3")
+@case("motion", "SPEC 2.5-23")
 def test_fresh_commands(drive: Wheels) -> None:
     """Fresh commands are obeyed, and a command of zero stops."""
     moving = drive.start()
@@ -26,7 +26,7 @@ def test_fresh_commands(drive: Wheels) -> None:
     drive.stands(moving)
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 7")
+@case("motion", "SPEC 2.5-28")
 def test_stops_when_commands_cease(drive: Wheels) -> None:
     """When commands cease the robot stands still within stop_within_ms, while its links live."""
     moving = drive.start()
@@ -36,15 +36,15 @@ def test_stops_when_commands_cease(drive: Wheels) -> None:
     assert took <= drive.stop_within + LATE, f"it took {took * 1000:.0f} ms"
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 6")
-def test_says_zero_again(drive: Wheels) -> None:
-    """Zero is said several times, because a best-effort subscriber may miss the first."""
+@case("motion", "SPEC 2.5-27")
+def test_zero_is_repeated(drive: Wheels) -> None:
+    """Zero is published several times, because a best-effort subscriber may miss the first."""
     drive.stands(drive.start())
     if drive.next_speed(0.5) is None:
         not_offered("zero is said once only (SHOULD)")
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 3")
+@case("motion", "SPEC 2.5-23")
 def test_old_commands(drive: Wheels) -> None:
     """Commands older than deadline_ms are dropped."""
     drive.stands(drive.start())
@@ -54,7 +54,7 @@ def test_old_commands(drive: Wheels) -> None:
     drive.start()
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 3")
+@case("motion", "SPEC 2.5-23")
 def test_old_commands_do_not_keep_it_moving(drive: Wheels) -> None:
     """Commands that are too old don't keep the robot moving."""
     drive.start()
@@ -66,7 +66,7 @@ def test_old_commands_do_not_keep_it_moving(drive: Wheels) -> None:
     drive.never_moves()
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 3")
+@case("motion", "SPEC 2.5-23")
 def test_commands_of_the_future(drive: Wheels) -> None:
     """Commands that lie in the future are dropped."""
     drive.stands(drive.start())
@@ -75,9 +75,9 @@ def test_commands_of_the_future(drive: Wheels) -> None:
     drive.never_goes(0.3)
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 4")
+@case("motion", "SPEC 2.5-25")
 def test_no_number(drive: Wheels) -> None:
-    """A command with what is no finite number is dropped, and the next one is obeyed."""
+    """A command with a number that is not finite is dropped, and the next one is obeyed."""
     drive.stands(drive.start())
     for _ in range(3):
         drive.not_finite()
@@ -107,7 +107,7 @@ def test_unadvertise_stops(drive: Wheels) -> None:
     assert min(took) < 0.6 * drive.stop_within, f"it took {[f'{each * 1000:.0f}' for each in took]} ms"
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 7")
+@case("motion", "SPEC 2.5-28")
 def test_cut_channel_stops(drive: Wheels) -> None:
     """When the channel link that drives is cut the robot stands still within stop_within_ms."""
     moving = drive.start()
@@ -116,7 +116,7 @@ def test_cut_channel_stops(drive: Wheels) -> None:
     assert took <= drive.stop_within + LATE, f"it took {took * 1000:.0f} ms"
 
 
-@case("motion", "SPEC 2.5, Clocks and deadline, 7")
+@case("motion", "SPEC 2.5-28")
 def test_other_samples_are_no_commands(drive: Wheels) -> None:
     """Samples of another number and pings are no commands: they don't keep it moving."""
     drive.start()
@@ -136,7 +136,7 @@ def test_cut_control_stops(relay: LinkRelay, drive: Wheels) -> None:
     drive.driving.wait_end()
     with relay.channel() as watching, relay.channel() as driving:
         again = Wheels(relay, driving, watching)
-        # What it reports first is the latest there was, because …/heard is kept for late joiners.
+        # The first report is the latest one, because …/heard is latched.
         assert again.next_speed(2) in (0, None)
         again.never_moves()
         again.start()

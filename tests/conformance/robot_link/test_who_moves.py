@@ -1,4 +1,4 @@
-"""Who moves the robot: orders, and whose commands are obeyed."""
+"""Control of the robot: orders, and sources whose commands are obeyed."""
 
 from __future__ import annotations
 
@@ -24,21 +24,23 @@ def control(relay: LinkRelay) -> Iterator[Link]:
         assert link.order("resume", by="the suite").get("ok", True)
 
 
-@case("control", "SPEC 2.4 orders, done, safety")
+@case("control", "SPEC 2.4 commands, order_result, motion_state")
 def test_orders_are_answered(control: Link) -> None:
-    """Each order is answered by done with its id, and what it changes is told by safety."""
-    assert control.order("control", holder=0).get("ok", True)
-    assert control.order("control", holder=DRIVER, user="ann", level="operator", why="asked").get("ok", True)
-    control.expect("safety", holder=DRIVER)
+    """Each order is answered by done with its id, and safety reports its changes."""
+    assert control.order("control_grant", holder=0).get("ok", True)
+    assert control.order("control_grant", holder=DRIVER, user="ann", level="operator", why="asked").get(
+        "ok", True
+    )
+    control.expect("motion_state", holder=DRIVER)
     assert control.order("stop", by="eve", why="a case").get("ok", True)
     while True:
-        stopped = control.expect("safety").get("stopped")
+        stopped = control.expect("motion_state").get("stopped")
         if stopped:
             break
     assert (stopped["by"], stopped.get("why", "")) == ("eve", "a case")
     assert abs(stopped["since"] - time.time()) < 86_400
     assert control.order("resume", by="ann").get("ok", True)
-    while control.expect("safety").get("stopped"):
+    while control.expect("motion_state").get("stopped"):
         pass
 
 
@@ -51,17 +53,17 @@ def test_orders_about_nothing(control: Link) -> None:
         assert done["reason"]
 
 
-@case("safety", "SPEC 2.4 safety, 2.5 Who moves the robot, 2")
+@case("safety", "SPEC 2.4 motion_state, 2.5-39")
 def test_safety_after_welcome(relay: LinkRelay) -> None:
-    """safety comes after welcome, and nobody holds control then."""
-    relay.control.order("control", holder=DRIVER)
+    """safety comes after welcome, and there is no holder then."""
+    relay.control.order("control_grant", holder=DRIVER)
     relay.control.cut()
-    assert relay.control.expect("safety").get("holder", 0) == 0
+    assert relay.control.expect("motion_state").get("holder", 0) == 0
 
 
-@case("inhibit", "SPEC 2.5 Who moves the robot, 6")
+@case("inhibit", "SPEC 2.5-50")
 def test_inhibit(relay: LinkRelay, control: Link, channel: Link) -> None:
-    """An inhibited topic says nothing for its time, and then goes on."""
+    """An inhibited topic sends nothing for its time, and then continues."""
     topic, _ = sensor(relay)
     subscribe(channel, relay)
     channel.expect_sample(7)
@@ -70,14 +72,14 @@ def test_inhibit(relay: LinkRelay, control: Link, channel: Link) -> None:
     channel.expect_sample(7, 4)
 
 
-@case("inhibit", "SPEC 2.5 Who moves the robot, 6")
+@case("inhibit", "SPEC 2.5-50")
 def test_hold(relay: LinkRelay, control: Link, channel: Link) -> None:
-    """With hold its last value comes in the place of new ones; ms of 0 ends it."""
+    """With hold its last value replaces new ones; ms of 0 ends it."""
     topic, _ = sensor(relay)
     subscribe(channel, relay)
     channel.expect_sample(7)
     assert control.order("inhibit", resource=topic, ms=5000, hold=True).get("ok", True)
-    time.sleep(0.2)  # what was on its way has come
+    time.sleep(0.2)  # messages under way have arrived
     with contextlib.suppress(AssertionError):
         while True:
             channel.expect_sample(7, 0.0)
@@ -86,9 +88,9 @@ def test_hold(relay: LinkRelay, control: Link, channel: Link) -> None:
     assert control.order("inhibit", resource=topic).get("ok", True)
 
 
-@case("control", "SPEC 2.5 Who moves the robot, 1")
+@case("control", "SPEC 2.5-38")
 def test_only_the_holder(drive: Wheels) -> None:
-    """Commands of who does not hold control are dropped, also while nobody does; the holder's are obeyed."""
+    """Commands of sources without control are dropped, also without a holder; the holder's are obeyed."""
     drive.stands(drive.start())
     for _ in range(5):
         drive.command(0.3, source=OTHER)
@@ -101,7 +103,7 @@ def test_only_the_holder(drive: Wheels) -> None:
     drive.start()
 
 
-@case("control", "SPEC 2.5 Who moves the robot, 1")
+@case("control", "SPEC 2.5-38")
 def test_samples_are_no_commands(drive: Wheels) -> None:
     """A sample to what moves it is dropped, also while the holder drives."""
     drive.stands(drive.start())
@@ -111,9 +113,9 @@ def test_samples_are_no_commands(drive: Wheels) -> None:
     drive.start()
 
 
-@case("control", "SPEC 2.5 Who moves the robot, 2")
+@case("control", "SPEC 2.5-39")
 def test_another_holder(drive: Wheels) -> None:
-    """A change of control stops what moves at once, and from then on the new holder is obeyed alone."""
+    """A change of control stops motion at once, and from then on only the new holder is obeyed."""
     moving = drive.start()
     drive.give(OTHER)
     assert drive.stands(moving) < 0.6 * drive.stop_within
@@ -123,9 +125,9 @@ def test_another_holder(drive: Wheels) -> None:
     drive.start(OTHER)
 
 
-@case("control", "SPEC 2.5 Who moves the robot, 2")
+@case("control", "SPEC 2.5-39")
 def test_same_holder(drive: Wheels) -> None:
-    """Control given to who has it does not stop him."""
+    """Control given to the present holder does not stop the robot."""
     drive.start()
     for _ in range(5):
         drive.give(DRIVER)
@@ -133,9 +135,9 @@ def test_same_holder(drive: Wheels) -> None:
         assert drive.next_speed(0.1) in (0.2, None)
 
 
-@case("stop", "SPEC 2.5 Who moves the robot, 3")
+@case("stop", "SPEC 2.5-41")
 def test_stop(drive: Wheels) -> None:
-    """stop is zero at once; what the holder says after it moves nothing."""
+    """stop is zero at once; the holder's commands after it move nothing."""
     moving = drive.start()
     assert drive.control.order("stop", by="eve").get("ok", True)
     assert drive.stands(moving) < 0.6 * drive.stop_within
@@ -143,15 +145,15 @@ def test_stop(drive: Wheels) -> None:
     drive.never_moves()
 
 
-@case("stop", "SPEC 2.5 Who moves the robot, 3")
+@case("stop", "SPEC 2.5-41")
 def test_stop_outlives_the_link(relay: LinkRelay, drive: Wheels) -> None:
-    """A robot that was stopped says so when it is back, and obeys nobody."""
+    """A robot that was stopped reports it when it is back, and obeys no source."""
     drive.start()
     assert drive.control.order("stop", by="eve").get("ok", True)
     relay.control.cut()
     control = relay.control
-    assert control.expect("safety")["stopped"]["by"] == "eve"
-    assert control.order("control", holder=DRIVER).get("ok", True)
+    assert control.expect("motion_state")["stopped"]["by"] == "eve"
+    assert control.order("control_grant", holder=DRIVER).get("ok", True)
     with relay.channel() as watching, relay.channel() as driving:
         again = Wheels(relay, driving, watching, resume=False)
         again.streams(0.2, 0.6)
@@ -160,24 +162,24 @@ def test_stop_outlives_the_link(relay: LinkRelay, drive: Wheels) -> None:
         again.start()
 
 
-@case("resume", "SPEC 2.5 Who moves the robot, 4")
+@case("resume", "SPEC 2.5-44")
 def test_resume_moves_nothing(drive: Wheels) -> None:
-    """Who goes on commanding through stop and resume is not obeyed until he was silent for 500 ms."""
+    """A source that commands through stop and resume is not obeyed until a pause of 500 ms."""
     moving = drive.start()
     assert drive.control.order("stop", by="eve").get("ok", True)
     drive.stands(moving)
     drive.streams(0.2, 0.3)
     drive.resume()
     drive.streams(0.2, 1.0)
-    time.sleep(0.8)  # lets go, whatever the way of a ping leaves in doubt
+    time.sleep(0.8)  # a pause that counts as a release, for any uncertainty of the ping
     until = time.monotonic() + 2
     while drive.next_speed(0.05) != 0.2:
         assert time.monotonic() < until, "it does not move after he let go"
         drive.command(0.2)
 
 
-@case("resume", "SPEC 2.5 Who moves the robot, 4")
-def test_zero_is_letting_go(drive: Wheels) -> None:
+@case("resume", "SPEC 2.5-44")
+def test_zero_is_a_release(drive: Wheels) -> None:
     """After the resume one command of zero is enough."""
     moving = drive.start()
     assert drive.control.order("stop", by="eve").get("ok", True)
@@ -188,9 +190,11 @@ def test_zero_is_letting_go(drive: Wheels) -> None:
     drive.start()
 
 
-@case("resume", "SPEC 2.5 Who moves the robot, 8")
+@case("resume", "SPEC 2.5-52")
 def test_sent_before_the_resume(drive: Wheels) -> None:
-    """What can have been sent before the resume is not obeyed after it, though its source has said zero."""
+    """Commands that may have been sent before the resume are not obeyed after it, even after a zero of their
+    source.
+    """
     moving = drive.start()
     assert drive.control.order("stop", by="eve").get("ok", True)
     drive.stands(moving)
@@ -198,14 +202,14 @@ def test_sent_before_the_resume(drive: Wheels) -> None:
     drive.resume()
     drive.command(0.0)
     for _ in range(5):
-        drive.command(0.3, age=time.monotonic() - before)
+        drive.command(0.3, at=before)
     drive.never_goes(0.3)
     drive.start()
 
 
-@case("resume", "SPEC 2.5 Who moves the robot, 8")
+@case("resume", "SPEC 2.5-52")
 def test_stall_is_no_silence(drive: Wheels) -> None:
-    """Who must let go has not, when nothing came for a while and then what can have been sent meanwhile."""
+    """A link without messages for a while, followed by delayed ones, is no release."""
     moving = drive.start()
     assert drive.control.order("stop", by="eve").get("ok", True)
     drive.stands(moving)
@@ -216,30 +220,30 @@ def test_stall_is_no_silence(drive: Wheels) -> None:
     drive.command(0.2)
     time.sleep(0.55)  # the link stalls
     for _ in range(5):
-        drive.command(0.3, age=time.monotonic() - last - 0.2)
+        drive.command(0.3, at=last + 0.2)
     drive.never_goes(0.3)
     drive.start()
 
 
-@case("control", "SPEC 2.5 Who moves the robot, 8")
+@case("control", "SPEC 2.5-52")
 def test_sent_before_control_was_lost(drive: Wheels) -> None:
-    """Who has control again is not obeyed in what he can have sent before he lost it."""
+    """A source with control again is not obeyed in commands that it may have sent before it lost control."""
     drive.start()
     before = time.monotonic()
     drive.give(OTHER)
     drive.give(DRIVER)
     drive.command(0.0)
     for _ in range(5):
-        drive.command(0.3, age=time.monotonic() - before)
+        drive.command(0.3, at=before)
     drive.never_goes(0.3)
     drive.start()
 
 
-@case("suppress", "SPEC 2.5 Who moves the robot, 5")
+@case("suppress", "SPEC 2.5-48")
 def test_suppress(drive: Wheels) -> None:
-    """For its time only the sources named are obeyed; as it begins and ends what the others moved is stopped."""
+    """For its time only the named sources are obeyed; at its begin and end the motion of others is stopped."""
     drive.start()
-    drive.command(0.0, source=OTHER)  # lets go of what it moved by an earlier link
+    drive.command(0.0, source=OTHER)  # releases motion of an earlier link
     done = drive.control.order("suppress", resource=drive.topic, sources=[OTHER], ms=200, by="a case")
     assert done.get("ok", True), done
     begun = time.monotonic()
@@ -257,11 +261,11 @@ def test_suppress(drive: Wheels) -> None:
     drive.start()
 
 
-@case("suppress", "SPEC 2.5 Who moves the robot, 5")
+@case("suppress", "SPEC 2.5-48")
 def test_suppression_ends_in_time(drive: Wheels) -> None:
-    """One that is renewed goes on; without that the robot is stopped when its time is over."""
+    """A renewed suppression continues; otherwise the robot is stopped when its time is over."""
     drive.start()
-    drive.command(0.0, source=OTHER)  # lets go of what it moved by an earlier link
+    drive.command(0.0, source=OTHER)  # releases motion of an earlier link
     moving = None
     for _ in range(5):
         drive.control.order("suppress", resource=drive.topic, sources=[OTHER], ms=150)

@@ -15,7 +15,7 @@ def test_another_relay(relay: LinkRelay) -> None:
     link, _ = relay.dialled("hello", relay.patience)
     relay.challenge(link, "another relay")
     link.wait_end()
-    # So that cases after this one would still be in order, should there be any.
+    # Otherwise later cases would not work, if there were any.
     relay.patience = PATIENCE_AFTER_ANOTHER_NAME
     with contextlib.suppress(AssertionError):
         link.expect("prove", 0.0)

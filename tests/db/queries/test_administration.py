@@ -1,4 +1,4 @@
-"""What administrators are told of their realm, on both databases."""
+"""Administrators' data of their realm, on both databases."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from relay_protocol.errors import Invalid, NotFound
 
 
 def test_patterns_are_counted_in_a_realm_and_on_a_robot(database: Database) -> None:
-    """Those that allow and those that deny; rights without any count nothing."""
+    """Allowing and denying ones; rights without any count as zero."""
     with database.begin() as s:
         for realm in ("lab1", "lab2"):
             queries.add_realm(s, realm)
@@ -29,7 +29,6 @@ def test_patterns_are_counted_in_a_realm_and_on_a_robot(database: Database) -> N
 
 
 def test_places_of_rights_are_those_of_the_realm(database: Database) -> None:
-    """Of a user also those of its groups; what a holder itself has is found by whom and where."""
     with database.begin() as s:
         queries.add_realm(s, "lab")
         ann, bob = (queries.add_user(s, name, None, realm="lab") for name in ("ann", "bob"))
@@ -39,21 +38,21 @@ def test_places_of_rights_are_those_of_the_realm(database: Database) -> None:
         queries.add_member(s, crew.id, ann.id)
         queries.grant_right(s, rover.id, "viewer", group_id=crew.id)
         queries.grant_right(s, rover.id, "operator", user_id=bob.id)
-        group, own = sorted(queries.right_places(s, "lab"))
+        group, own = sorted(queries.list_right_holders(s, "lab"))
         assert group == RightOnRobot(group.id, "rover", None, "crew")
         assert own == RightOnRobot(own.id, "rover", "bob", None)
-        assert queries.right_places(s, "lab", user_id=ann.id) == [group]
-        assert queries.right_places(s, "lab", robot_id=other[1].id) == []
-        held = queries.right_held(s, rover.id, user_id=bob.id)
+        assert queries.list_right_holders(s, "lab", user_id=ann.id) == [group]
+        assert queries.list_right_holders(s, "lab", robot_id=other[1].id) == []
+        held = queries.get_right(s, rover.id, user_id=bob.id)
         assert held is not None and (held.id, held.level) == (own.id, "operator")
-        assert queries.right_held(s, rover.id, user_id=ann.id) is None
+        assert queries.get_right(s, rover.id, user_id=ann.id) is None
         assert [each.id for each in queries.list_rights(s, ids=[group.id])] == [group.id]
         with pytest.raises(Invalid):
-            queries.right_held(s, rover.id)
+            queries.get_right(s, rover.id)
 
 
 def test_how_much_is_in_a_realm(database: Database) -> None:
-    """All that is counted of it, and nothing of another."""
+    """All its counts, without other realms."""
     with database.begin() as s:
         for realm, names in (("lab1", ("ann",)), ("lab2", ("ann", "bob"))):
             queries.add_realm(s, realm)
@@ -64,30 +63,28 @@ def test_how_much_is_in_a_realm(database: Database) -> None:
                 queries.add_member(s, group.id, user.id)
                 queries.grant_right(s, robot.id, "viewer", user_id=user.id)
                 queries.add_to_robot_group(s, robots.id, robot.id)
-                queries.add_program(s, user.id, user.full, "f" * 64, scope=None, label="", now=1.0)
+                queries.add_oauth_client(s, user.id, user.full, "f" * 64, scope=None, label="", now=1.0)
         assert queries.realm_size(s, "lab1") == (1,) * 8
         assert queries.realm_size(s, "lab2") == (2, 1, 2, 2, 2, 2, 1, 2)
         assert queries.realm_size(s, "nowhere") == (0,) * 8
 
 
-def test_a_robot_is_described_anew(database: Database) -> None:
-    """By one line that can be printed; one that is not there is not described."""
+def test_a_robot_gets_a_new_description(database: Database) -> None:
     with database.begin() as s:
         rover = queries.add_robot(s, "rover", "old")
-        queries.describe_robot(s, rover.id, "new")
+        queries.set_robot_description(s, rover.id, "new")
         with pytest.raises(Invalid, match="description of a robot"):
-            queries.describe_robot(s, rover.id, "a\nb")
+            queries.set_robot_description(s, rover.id, "a\nb")
         with pytest.raises(NotFound):
-            queries.describe_robot(s, rover.id + 1, "other")
+            queries.set_robot_description(s, rover.id + 1, "other")
         assert queries.find_robot(s, "rover") == rover._replace(description="new")
 
 
 def test_whose_a_token_is(database: Database) -> None:
-    """By its full name; nobody's, if there is none of that number."""
     with database.begin() as s:
         queries.add_realm(s, "lab")
         ann = queries.add_user(s, "ann", None, realm="lab")
         token = queries.create_token(s, ann.id, "a" * 64, kind="access", expires=None, now=1.0)
         assert queries.user_of_token(s, token) == "ann@lab"
         assert queries.user_of_token(s, token + 1) is None
-        assert queries.user_of_program(s, 1) is None
+        assert queries.user_of_oauth_client(s, 1) is None

@@ -1,4 +1,4 @@
-"""Alerts are kept as they are now, and rules by which people are told of them."""
+"""Alerts with their present state, and notification rules."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sqlalchemy import event
 from relay_db import queries
 from relay_db.engine import Database
 from relay_db.queries import alerts as module
-from relay_db.queries.alerts import RULES
+from relay_db.queries.alerts import MAX_RULES
 from relay_protocol.errors import Invalid, NotFound
 
 
 def an_alert(robot: int, id: str = "a1", **other: object) -> queries.AlertRecord:
-    """One that lasts."""
+    """An open alert."""
     made = queries.AlertRecord(
         id,
         robot,
@@ -38,18 +38,20 @@ def an_alert(robot: int, id: str = "a1", **other: object) -> queries.AlertRecord
 
 
 def a_rule(user: int) -> dict[str, object]:
-    """What is needed for a rule."""
+    """Required values of a rule."""
     return {"user_id": user, "level": "warning", "channel": "portal", "group_s": 60.0, "created": 1.5}
 
 
 def test_an_alert_is_written_again_in_its_place(database: Database) -> None:
-    """The same id is the same row, with what it is now."""
+    """The same id is the same row, with the present state."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         queries.save_alerts(s, [an_alert(robot), an_alert(robot, "b2", last=11.0)])
-        queries.save_alerts(s, [an_alert(robot, times=3, over=12.25, ack_by="ann", ack_at=11.5)])
+        queries.save_alerts(s, [an_alert(robot, report_count=3, over=12.25, ack_by="ann", ack_at=11.5)])
     with database.reading() as s:
-        assert queries.get_alert(s, "a1") == an_alert(robot, times=3, over=12.25, ack_by="ann", ack_at=11.5)
+        assert queries.get_alert(s, "a1") == an_alert(
+            robot, report_count=3, over=12.25, ack_by="ann", ack_at=11.5
+        )
         assert [each.id for each in queries.list_alerts(s)] == ["b2", "a1"]
         assert [each.id for each in queries.list_alerts(s, open=True)] == ["b2"]
         assert [each.id for each in queries.list_alerts(s, [robot], open=False)] == ["a1"]
@@ -60,7 +62,7 @@ def test_an_alert_is_written_again_in_its_place(database: Database) -> None:
 
 
 def test_alerts_go_with_their_robot_and_none_comes_for_one_that_is_gone(database: Database) -> None:
-    """A robot may be removed while its alert is on the way."""
+    """A robot may be removed before its alert is written."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         queries.save_alerts(s, [an_alert(robot)])
@@ -69,7 +71,7 @@ def test_alerts_go_with_their_robot_and_none_comes_for_one_that_is_gone(database
         assert queries.list_alerts(s) == []
 
 
-def test_what_a_relay_begins_with_is_what_lasts_or_was_over_of_late(database: Database) -> None:
+def test_recent_alerts_are_open_or_ended_recently(database: Database) -> None:
     """Old ones stay in the table."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
@@ -79,11 +81,10 @@ def test_what_a_relay_begins_with_is_what_lasts_or_was_over_of_late(database: Da
         assert sorted(each.id for each in queries.recent_alerts(s, 25.0)) == ["a1", "c3"]
 
 
-def test_one_robots_many_alerts_keep_no_others_from_being_known(
+def test_alerts_of_a_robot_do_not_hide_those_of_others(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who begins gets all that last, who looks after them too, and of those that are over some of each robot."""
-    monkeypatch.setattr(module, "_RECENT", 2)
+    monkeypatch.setattr(module, "_MAX_RECENT", 2)
     with database.begin() as s:
         queries.add_realm(s, "lab1")
         loud, quiet = queries.add_robot(s, "rover").id, queries.add_robot(s, "rover", realm="lab1").id
@@ -97,8 +98,7 @@ def test_one_robots_many_alerts_keep_no_others_from_being_known(
         assert sorted(queries.acknowledgements(s)) == ["l0", "l1", "l2", "l3", "l4", "q1"]
 
 
-def test_alerts_are_listed_on_from_where_a_list_ended_without_what_is_not_wanted(database: Database) -> None:
-    """Also where several were told at the same time; a kind of some robots, and single parts."""
+def test_next_page_begins_behind_the_last_alert_and_leaves_out_excluded_ones(database: Database) -> None:
     with database.begin() as s:
         rover, digger = queries.add_robot(s, "rover").id, queries.add_robot(s, "digger").id
         queries.save_alerts(
@@ -114,7 +114,9 @@ def test_alerts_are_listed_on_from_where_a_list_ended_without_what_is_not_wanted
         assert [each.id for each in whole] == ["a0", "a1", "a2", "a3", "d1", "d2", "d3"]
         for number, each in enumerate(whole):
             assert queries.list_alerts(s, after=(each.last, each.id)) == whole[number + 1 :]
-        wanted = queries.list_alerts(s, kinds_but={"diagnostics": [rover]}, but=[(rover, "stale", "/t0")])
+        wanted = queries.list_alerts(
+            s, except_kinds={"diagnostics": [rover]}, except_alerts=[(rover, "stale", "/t0")]
+        )
         assert [each.id for each in wanted] == ["a1", "a3", "d2", "d3"]
 
 
@@ -122,7 +124,6 @@ def test_alerts_are_listed_on_from_where_a_list_ended_without_what_is_not_wanted
 def test_a_page_of_a_long_list_is_read_from_where_it_begins(
     sqlite: Database, robots: int, index: str
 ) -> None:
-    """By an index, in the order of the list: not all that was ever told is sorted for it, however old the page."""
     asked: list[tuple[str, Any]] = []
     with sqlite.reading() as s:
         connection = s.connection()
@@ -140,8 +141,7 @@ def test_a_page_of_a_long_list_is_read_from_where_it_begins(
     assert "USE TEMP B-TREE FOR ORDER BY" not in plan
 
 
-def test_an_acknowledgement_is_seen_by_who_looks_for_changes(database: Database) -> None:
-    """It counts the revision up, and names who and when."""
+def test_an_acknowledgement_counts_up_the_revision(database: Database) -> None:
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         queries.save_alerts(s, [an_alert(robot)])
@@ -160,20 +160,22 @@ def test_an_acknowledgement_is_seen_by_who_looks_for_changes(database: Database)
 
 
 def test_old_alerts_and_too_many_are_forgotten_but_none_that_lasts(database: Database) -> None:
-    """The oldest of those that are over go first, a batch at a time."""
+    """The oldest of the ended ones are deleted first, in batches."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         over = [an_alert(robot, f"o{each}", last=float(each), over=float(each)) for each in range(6)]
         queries.save_alerts(s, [*over, an_alert(robot, "open", last=0.0)])
-        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 2
-        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 1
-        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 1
-        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 0
+        assert queries.purge_alerts(s, 3.0, max_alerts=3, batch=2) == 2
+        assert queries.purge_alerts(s, 3.0, max_alerts=3, batch=2) == 1
+        assert queries.purge_alerts(s, 3.0, max_alerts=3, batch=2) == 1
+        assert queries.purge_alerts(s, 3.0, max_alerts=3, batch=2) == 0
         assert [each.id for each in queries.list_alerts(s)] == ["o5", "o4", "open"]
 
 
 def test_a_realm_with_too_many_alerts_costs_no_other_one_any(database: Database) -> None:
-    """Each has so many; where all that are too many last, those of the next are looked after all the same."""
+    """Each has its own limit; even if all surplus alerts of one realm are open, those of the next are
+    deleted.
+    """
     with database.begin() as s:
         queries.add_realm(s, "lab1")
         queries.add_realm(s, "lab2")
@@ -182,27 +184,26 @@ def test_a_realm_with_too_many_alerts_costs_no_other_one_any(database: Database)
         queries.save_alerts(s, [an_alert(here, f"h{each}") for each in range(4)])
         queries.save_alerts(s, [an_alert(lab1, f"a{each}", last=1.0, over=5.0) for each in range(2)])
         queries.save_alerts(s, [an_alert(lab2, f"b{each}", last=9.0 + each, over=20.0) for each in range(5)])
-        assert [queries.purge_alerts(s, 0.0, most=2, batch=2) for _ in range(3)] == [2, 1, 0]
+        assert [queries.purge_alerts(s, 0.0, max_alerts=2, batch=2) for _ in range(3)] == [2, 1, 0]
         assert [each.id for each in queries.list_alerts(s, [lab1, lab2])] == ["b4", "b3", "a0", "a1"]
         assert len(queries.list_alerts(s, [here])) == 4
 
 
-def test_rules_are_kept_as_they_were_given(database: Database) -> None:
-    """Whoever asks for all of them gets those of users who may log in."""
+def test_rules_are_stored_unchanged(database: Database) -> None:
     quiet = {"from": "22:00", "to": "07:00", "zone": "Europe/Rome", "least": "error"}
     with database.begin() as s:
         ann, bob = queries.add_user(s, "ann", None).id, queries.add_user(s, "bob", None).id
         made = queries.add_alert_rule(
             s,
             ann,
-            name="pager",
+            label="pager",
             robots="r*",
             kinds=["offline"],
             level="error",
             channel="webhook",
             url="https://example.org/hook",
             secret="s" * 32,
-            over=False,
+            notify_end=False,
             group_s=5.0,
             quiet=quiet,
             created=1.5,
@@ -220,7 +221,6 @@ def test_rules_are_kept_as_they_were_given(database: Database) -> None:
 
 
 def test_numbers_of_rules_are_drawn(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None that is taken; whoever sees his own learns nothing of how many there are, and they stay in order."""
     drawn = iter([2**31 - 2, 2**31 - 2, 6])
     asked: list[int] = []
     monkeypatch.setattr(secrets, "randbelow", lambda below: asked.append(below) or next(drawn))
@@ -232,8 +232,7 @@ def test_numbers_of_rules_are_drawn(database: Database, monkeypatch: pytest.Monk
     assert asked == [2**31 - 1] * 3
 
 
-def test_a_rule_is_removed_by_whom_it_belongs_to(database: Database) -> None:
-    """Of another user it is as if it were not there; with its user it goes."""
+def test_a_rule_is_removed_only_by_its_user(database: Database) -> None:
     with database.begin() as s:
         ann, bob = queries.add_user(s, "ann", None).id, queries.add_user(s, "bob", None).id
         one = queries.add_alert_rule(s, **a_rule(ann)).id  # type: ignore[arg-type]  # as above
@@ -249,10 +248,9 @@ def test_a_rule_is_removed_by_whom_it_belongs_to(database: Database) -> None:
 
 
 def test_a_user_has_a_bounded_number_of_rules(database: Database) -> None:
-    """And nobody has one who is not there."""
     with database.begin() as s:
         ann = queries.add_user(s, "ann", None).id
-        for _ in range(RULES):
+        for _ in range(MAX_RULES):
             queries.add_alert_rule(s, **a_rule(ann))  # type: ignore[arg-type]  # as above
         with pytest.raises(Invalid, match="at most 32"):
             queries.add_alert_rule(s, **a_rule(ann))  # type: ignore[arg-type]  # as above
@@ -261,19 +259,19 @@ def test_a_user_has_a_bounded_number_of_rules(database: Database) -> None:
 
 
 def test_an_acknowledgement_the_relay_has_not_seen_outlives_its_next_word(database: Database) -> None:
-    """It ends when the alert becomes worse or comes back, as any."""
+    """It ends when the alert becomes worse or returns, as any."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         queries.save_alerts(s, [an_alert(robot)])
         queries.acknowledge_alert(s, "a1", "cli:ann", 12.5)
-        queries.save_alerts(s, [an_alert(robot, times=2, last=13.0)])
+        queries.save_alerts(s, [an_alert(robot, report_count=2, last=13.0)])
         assert queries.acknowledgements(s) == {"a1": ("cli:ann", 12.5)}
-        queries.save_alerts(s, [an_alert(robot, times=3, last=14.0, over=14.0, news=2)])
+        queries.save_alerts(s, [an_alert(robot, report_count=3, last=14.0, over=14.0, notification_count=2)])
         assert queries.get_alert(s, "a1") == an_alert(
-            robot, times=3, last=14.0, over=14.0, news=2, ack_by="cli:ann", ack_at=12.5
+            robot, report_count=3, last=14.0, over=14.0, notification_count=2, ack_by="cli:ann", ack_at=12.5
         )
-        queries.save_alerts(s, [an_alert(robot, times=4, last=15.0, news=2)])
+        queries.save_alerts(s, [an_alert(robot, report_count=4, last=15.0, notification_count=2)])
         assert queries.acknowledgements(s) == {}
         queries.acknowledge_alert(s, "a1", "cli:ann", 15.5)
-        queries.save_alerts(s, [an_alert(robot, times=5, last=16.0, news=3)])
+        queries.save_alerts(s, [an_alert(robot, report_count=5, last=16.0, notification_count=3)])
         assert queries.acknowledgements(s) == {}

@@ -1,4 +1,4 @@
-"""The counter that tells a running relay that something about access changed."""
+"""The counter that notifies a running relay of changed rights."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ CHANGES: dict[str, Callable[[Session], object]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_what_changes_access_counts_the_revision_up(
+def test_changes_of_access_count_up_the_revision(
     filled: Database, change: Callable[[Session], object]
 ) -> None:
     """In the same transaction as the change itself."""
@@ -72,11 +72,10 @@ def test_a_revoked_key_counts_the_revision_up(filled: Database) -> None:
         assert queries.revision(s) > before
 
 
-def test_what_changes_nothing_about_access_leaves_the_revision(filled: Database) -> None:
-    """Events, audit entries, new tokens and codes give nobody a reason to look."""
+def test_other_changes_leave_the_revision(filled: Database) -> None:
     with filled.begin() as s:
         before = queries.revision(s)
-        queries.record_event(s, at=1.0, kind="online", source="relay", data={})
+        queries.store_events(s, [queries.NewStoredEvent("default", 1.0, "relay", "online", None, None, "{}")])
         queries.append_audit(s, at=1.0, actor="a", action="b", target="c")
         queries.create_token(s, 1, "b" * 64, kind="session", expires=None, now=1.0)
         queries.issue_enrolment_code(s, 1, "c" * 64, expires=10.0)
@@ -84,7 +83,7 @@ def test_what_changes_nothing_about_access_leaves_the_revision(filled: Database)
 
 
 def test_a_change_that_is_rolled_back_does_not_count(filled: Database) -> None:
-    """The relay has nothing to see."""
+    """The relay has nothing to apply."""
     with filled.reading() as s:
         before = queries.revision(s)
     with pytest.raises(ZeroDivisionError), filled.begin() as s:

@@ -11,7 +11,6 @@ from relay_protocol.rights import Grant, Level
 
 
 def test_no_right_no_grant(database: Database) -> None:
-    """A user has nothing until it is given, and nobody has anything."""
     with database.begin() as s:
         ann, rover = queries.add_user(s, "ann", None), queries.add_robot(s, "rover")
         assert queries.grants_for(s, ann.id, rover.id) == []
@@ -21,7 +20,7 @@ def test_no_right_no_grant(database: Database) -> None:
 
 
 def test_grants_come_from_the_user_and_its_groups(database: Database) -> None:
-    """Each says where it comes from; other users' and other robots' don't count."""
+    """Each has its source; other users' and other robots' rights do not count."""
     with database.begin() as s:
         ann, bob = queries.add_user(s, "ann", None), queries.add_user(s, "bob", None)
         rover, arm = queries.add_robot(s, "rover"), queries.add_robot(s, "arm")
@@ -43,7 +42,7 @@ def test_grants_come_from_the_user_and_its_groups(database: Database) -> None:
 
 
 def test_an_admin_owns_every_robot_of_the_realm(database: Database) -> None:
-    """Its own right, with what it denies, counts too; another realm's robots do not."""
+    """Its own right with its denials counts too; other realms' robots do not."""
     with database.begin() as s:
         queries.add_realm(s, "plant")
         rover, abroad = queries.add_robot(s, "rover"), queries.add_robot(s, "rover", realm="plant")
@@ -71,7 +70,6 @@ def test_a_right_replaces_the_one_before(database: Database) -> None:
 
 
 def test_a_right_is_revoked_from_its_holder_only(database: Database) -> None:
-    """Revoking tells whether there was one; the group's stays."""
     with database.begin() as s:
         ann, rover = queries.add_user(s, "ann", None), queries.add_robot(s, "rover")
         lab = queries.add_group(s, "lab")
@@ -86,7 +84,7 @@ def test_a_right_is_revoked_from_its_holder_only(database: Database) -> None:
 
 
 def test_rights_are_listed_by_robot_and_holder(database: Database) -> None:
-    """The list of a user holds what its groups give."""
+    """The list of a user includes the rights of its groups."""
     with database.begin() as s:
         ann, bob = queries.add_user(s, "ann", None), queries.add_user(s, "bob", None)
         rover, arm = queries.add_robot(s, "rover"), queries.add_robot(s, "arm")
@@ -106,7 +104,6 @@ def test_rights_are_listed_by_robot_and_holder(database: Database) -> None:
 
 
 def test_rights_that_cannot_be_are_refused(database: Database) -> None:
-    """Unknown level or pattern, too many patterns, no or two holders, strangers, nobody."""
     with database.begin() as s:
         queries.add_realm(s, "plant")
         ann, rover = queries.add_user(s, "ann", None), queries.add_robot(s, "rover")

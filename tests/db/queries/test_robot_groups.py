@@ -10,7 +10,7 @@ from relay_protocol.errors import Invalid, NotFound
 
 
 def test_a_group_has_its_robots_by_name(database: Database) -> None:
-    """Each once, however often it is put in; the group is found in any case."""
+    """Each once, after repeated additions too; the group is found in any case."""
     with database.begin() as s:
         group = queries.add_robot_group(s, "Cleaners")
         for name in ("cleaner-2", "cleaner-1", "other"):
@@ -30,7 +30,7 @@ def test_a_group_has_its_robots_by_name(database: Database) -> None:
 
 
 def test_robots_leave_and_groups_go(database: Database) -> None:
-    """A robot that is removed is in no group any more; a group that is removed leaves its robots."""
+    """A removed robot leaves its groups; a removed group keeps its robots."""
     with database.begin() as s:
         group = queries.add_robot_group(s, "cleaners")
         one, two = queries.add_robot(s, "one"), queries.add_robot(s, "two")
@@ -48,8 +48,7 @@ def test_robots_leave_and_groups_go(database: Database) -> None:
             queries.remove_robot_group(s, group.id)
 
 
-def test_what_can_not_be_is_refused(database: Database) -> None:
-    """Names that are taken or none, other realms, what is not there; a group changes nobody's rights."""
+def test_impossible_value_is_refused(database: Database) -> None:
     with database.begin() as s:
         before = queries.revision(s)
         group = queries.add_robot_group(s, "cleaners")
@@ -61,7 +60,7 @@ def test_what_can_not_be_is_refused(database: Database) -> None:
             queries.add_robot_group(s, "more", "nowhere")
         queries.add_realm(s, "plant")
         far = queries.add_robot(s, "far", realm="plant")
-        with pytest.raises(Invalid, match="not of the realm"):
+        with pytest.raises(Invalid, match="not belong to the realm"):
             queries.add_to_robot_group(s, group.id, far.id)
         for pair in ((group.id, -1), (-1, far.id)):
             with pytest.raises(NotFound):

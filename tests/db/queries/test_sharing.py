@@ -26,12 +26,11 @@ def _labs(s: Session) -> Any:
 
 
 def _log_in(s: Session, user_id: int, token: str) -> int:
-    """By the password whose hash is :data:`HASH`."""
+    """With the password whose hash is :data:`HASH`."""
     return queries.open_session(s, user_id, token * 64, password_hash=HASH, expires=NOW + 60, now=NOW)
 
 
 def test_a_shared_robot_is_found_in_each_of_its_realms(database: Database) -> None:
-    """As the same one, with its own realm; nowhere else."""
     with database.begin() as s:
         mobile, _, _ = _labs(s)
         assert queries.find_robot(s, "mobile", "lab2") is None
@@ -48,12 +47,12 @@ def test_a_shared_robot_is_found_in_each_of_its_realms(database: Database) -> No
 
 
 def test_rights_on_a_shared_robot_are_given_in_each_realm(database: Database) -> None:
-    """Before it is shared none can be; and the lists of a realm have only those that are held in it."""
+    """Not before it is shared; the lists of a realm have only its own rights."""
     with database.begin() as s:
         mobile, ann, root = _labs(s)
         luigi = queries.add_user(s, "luigi", None, realm="lab1")
         queries.grant_right(s, mobile.id, "owner", user_id=luigi.id, allow=["call:/a"])
-        with pytest.raises(Invalid, match="not of the realm"):
+        with pytest.raises(Invalid, match="not belong to the realm"):
             queries.grant_right(s, mobile.id, "viewer", user_id=ann.id)
         assert queries.grants_for(s, root.id, mobile.id) == []
         queries.share_robot(s, mobile.id, "lab2")
@@ -61,8 +60,8 @@ def test_rights_on_a_shared_robot_are_given_in_each_realm(database: Database) ->
         assert [each.level for each in queries.grants_for(s, ann.id, mobile.id)] == [Level.VIEWER]
         assert [robot for robot, _ in queries.robots_with_grants(s, ann.id)] == [mobile]
         assert [each.level for each in queries.grants_for(s, root.id, mobile.id)] == [Level.OWNER]
-        assert [each.user for each in queries.right_places(s, "lab1")] == ["luigi"]
-        assert [each.user for each in queries.right_places(s, "lab2", robot_id=mobile.id)] == ["ann"]
+        assert [each.user for each in queries.list_right_holders(s, "lab1")] == ["luigi"]
+        assert [each.user for each in queries.list_right_holders(s, "lab2", robot_id=mobile.id)] == ["ann"]
         assert [queries.count_patterns(s, realm=each) for each in ("lab1", "lab2")] == [1, 0]
         assert [queries.realm_size(s, each).rights for each in ("lab1", "lab2")] == [1, 1]
         assert [(each.user, each.realm) for each in queries.list_rights(s, robot_id=mobile.id)] == [
@@ -71,8 +70,8 @@ def test_rights_on_a_shared_robot_are_given_in_each_realm(database: Database) ->
         ]
 
 
-def test_what_a_realm_has_of_a_robot_goes_when_it_is_shared_no_more(database: Database) -> None:
-    """Rights, places in groups, entries of the directory; those of its own realm stay."""
+def test_unsharing_removes_rights_groups_and_entries_of_the_realm(database: Database) -> None:
+    """Rights, memberships in groups, and registry entries; those of its own realm stay."""
     with database.begin() as s:
         mobile, ann, root = _labs(s)
         luigi = queries.add_user(s, "luigi", None, realm="lab1")
@@ -88,12 +87,12 @@ def test_what_a_realm_has_of_a_robot_goes_when_it_is_shared_no_more(database: Da
         assert found is not None and found.robots == ()
         assert queries.find_robot(s, "mobile", "lab2") is None
         assert [queries.grants_for(s, each.id, mobile.id) for each in (ann, root)] == [[], []]
-        with pytest.raises(NotFound, match="not of the realm"):
+        with pytest.raises(NotFound, match="not belong to the realm"):
             queries.unshare_robot(s, mobile.id, "lab2")
 
 
 def test_robots_are_shared_where_their_name_is_free(database: Database) -> None:
-    """Once, with a realm that there is; and from their own they are not taken."""
+    """Once, with an existing realm; a robot stays in its own realm."""
     with database.begin() as s:
         mobile, _, _ = _labs(s)
         other = queries.add_robot(s, "mobile", realm="lab2")
@@ -115,7 +114,7 @@ def test_robots_are_shared_where_their_name_is_free(database: Database) -> None:
 
 
 def test_a_realm_with_a_robot_of_another_stays(database: Database) -> None:
-    """Until it is taken out, or removed altogether."""
+    """Until the robot is unshared or removed."""
     with database.begin() as s:
         mobile, ann, root = _labs(s)
         for each in (ann, root):
@@ -129,7 +128,7 @@ def test_a_realm_with_a_robot_of_another_stays(database: Database) -> None:
 
 
 def test_keys_are_handed_in_under_the_own_realm(database: Database) -> None:
-    """A code is no good under the name that the robot has elsewhere."""
+    """A code is not valid under the robot's name elsewhere."""
     with database.begin() as s:
         mobile, _, _ = _labs(s)
         queries.share_robot(s, mobile.id, "lab2")
@@ -142,12 +141,11 @@ def test_keys_are_handed_in_under_the_own_realm(database: Database) -> None:
         assert queries.robot_key(s, "mobile", "f" * 64, "lab1") is not None
 
 
-def test_a_guest_has_the_password_of_his_own_account(database: Database) -> None:
-    """And no rights but those of the account; a new password is one for both, and ends the sessions of both."""
+def test_a_linked_account_has_the_password_of_the_home_account(database: Database) -> None:
     with database.begin() as s:
         queries.add_realm(s, "lab1")
         toad = queries.add_user(s, "toad", HASH, admin=True)
-        guest = queries.add_guest(s, toad.id, "lab1")
+        guest = queries.add_linked_account(s, toad.id, "lab1")
         assert (guest.full, guest.home, guest.admin) == ("toad@lab1", "toad", False)
         assert queries.find_user(s, "toad", "lab1") == guest
         assert guest.password_hash == HASH
@@ -164,13 +162,12 @@ def test_a_guest_has_the_password_of_his_own_account(database: Database) -> None
         assert found is not None and found.password_hash == "another"
 
 
-def test_who_is_shut_out_is_so_everywhere(database: Database) -> None:
-    """And a guest that is shut out is so in his realm alone; who is removed goes with all of his accounts."""
+def test_disabling_a_user_disables_linked_accounts(database: Database) -> None:
     with database.begin() as s:
         for realm in ("lab1", "lab2"):
             queries.add_realm(s, realm)
         toad = queries.add_user(s, "toad", HASH)
-        guest = queries.add_guest(s, toad.id, "lab1")
+        guest = queries.add_linked_account(s, toad.id, "lab1")
         rover = queries.add_robot(s, "rover", realm="lab1")
         queries.grant_right(s, rover.id, "viewer", user_id=guest.id)
         token = queries.create_token(s, guest.id, "a" * 64, kind="access", expires=None, now=NOW)
@@ -187,23 +184,24 @@ def test_who_is_shut_out_is_so_everywhere(database: Database) -> None:
         queries.set_disabled(s, toad.id, False)
         queries.set_disabled(s, guest.id, True)
         assert [queries.user_is_live(s, each.id) for each in (toad, guest)] == [True, False]
-        queries.add_guest(s, guest.id, "lab2")
+        queries.add_linked_account(s, guest.id, "lab2")
         queries.remove_user(s, toad.id)
         assert queries.list_users(s) == []
 
 
-def test_accounts_of_one_person_are_found_by_any_of_them(database: Database) -> None:
-    """In each realm its own; nobody else of the same name counts."""
+def test_linked_accounts_are_found_by_any_of_them(database: Database) -> None:
     with database.begin() as s:
         for realm in ("lab1", "lab2"):
             queries.add_realm(s, realm)
         toad = queries.add_user(s, "toad", HASH)
-        guest = queries.add_guest(s, toad.id, "lab1")
+        guest = queries.add_linked_account(s, toad.id, "lab1")
         queries.add_user(s, "toad", HASH, realm="lab2")
         for each in (toad, guest):
-            found = [queries.account_in(s, each.id, realm) for realm in ("default", "lab1", "lab2", "lab3")]
+            found = [
+                queries.linked_account_in(s, each.id, realm) for realm in ("default", "lab1", "lab2", "lab3")
+            ]
             assert [account and account.id for account in found] == [toad.id, guest.id, None, None]
         with pytest.raises(Invalid, match="already"):
-            queries.add_guest(s, toad.id, "lab2")
+            queries.add_linked_account(s, toad.id, "lab2")
         with pytest.raises(NotFound):
-            queries.add_guest(s, toad.id, "lab3")
+            queries.add_linked_account(s, toad.id, "lab3")

@@ -1,4 +1,4 @@
-"""Orders to stop are kept until the robot has confirmed them."""
+"""Stored stops stay until the robot has confirmed them."""
 
 from __future__ import annotations
 
@@ -9,37 +9,49 @@ from relay_db.engine import Database
 from relay_protocol.errors import NotFound
 
 
-def test_an_order_is_kept_until_it_is_told(database: Database) -> None:
-    """What is written is read again, by robot and for all; told, it is gone."""
+def test_an_order_is_stored_until_it_is_confirmed(database: Database) -> None:
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         other = queries.add_robot(s, "mule").id
         order = queries.order_stop(s, robot, "ann", "smoke", 12.25)
     with database.reading() as s:
-        assert queries.pending_stop(s, robot) == order == (robot, "ann", "smoke", 12.25)
+        assert queries.pending_stop(s, robot) == order == (robot, "ann", "smoke", 12.25, "")
         assert queries.pending_stop(s, other) is None
         assert queries.pending_stops(s) == [order]
     with database.begin() as s:
-        assert queries.stop_told(s, robot, 12.25)
-        assert not queries.stop_told(s, robot, 12.25)
+        assert queries.remove_stop(s, robot, 12.25)
+        assert not queries.remove_stop(s, robot, 12.25)
         assert queries.pending_stops(s) == []
 
 
 def test_a_newer_order_takes_the_place_of_the_older(database: Database) -> None:
-    """That the older one was told does not end the newer one."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         queries.order_stop(s, robot, "ann", "smoke", 1.5)
         queries.order_stop(s, robot, "bob", "fire", 2.5)
-        assert not queries.stop_told(s, robot, 1.5)
+        assert not queries.remove_stop(s, robot, 1.5)
         order = queries.pending_stop(s, robot)
     assert order is not None
     assert (order.by, order.why) == ("bob", "fire")
     with database.begin() as s:
-        assert queries.stop_told(s, robot)
+        assert queries.remove_stop(s, robot)
 
 
-def test_text_from_anyone_is_kept_printable_and_short(database: Database) -> None:
+def test_an_order_with_the_id_of_a_stored_one_is_not_stored_again(database: Database) -> None:
+    with database.begin() as s:
+        robot = queries.add_robot(s, "rover").id
+        order = queries.order_stop(s, robot, "ann", "smoke", 1.5, "press-1")
+        assert not queries.order_stop_once(s, robot, "ann", "smoke", 2.5, "press-1")
+        assert queries.pending_stop(s, robot) == order
+        revision = queries.revision(s)
+        assert queries.order_stop_once(s, robot, "ann", "smoke", 2.5, "press-2")
+        assert queries.order_stop_once(s, robot, "bob", "smoke", 3.5, "press-2")
+        assert queries.order_stop_once(s, robot, "bob", "smoke", 4.5, "")
+        assert queries.order_stop_once(s, robot, "bob", "smoke", 5.5, "")
+        assert queries.revision(s) == revision + 4
+
+
+def test_text_is_stored_printable_and_cut(database: Database) -> None:
     """NUL and endless reasons do not reach the database."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
@@ -47,12 +59,12 @@ def test_text_from_anyone_is_kept_printable_and_short(database: Database) -> Non
     with database.reading() as s:
         assert queries.pending_stop(s, robot) == order
     assert len(order.by) == 255
-    assert len(order.why) == 4096
+    assert len(order.why) == 500
     assert order.why.isprintable()
 
 
 def test_an_order_goes_with_its_robot(database: Database) -> None:
-    """A robot that is removed leaves none, and one that never was gets none."""
+    """A removed robot has none, and an unknown one gets none."""
     with database.begin() as s:
         robot = queries.add_robot(s, "rover").id
         queries.order_stop(s, robot, "ann", "", 1.0)

@@ -22,7 +22,7 @@ def ann(database: Database) -> UserRecord:
 
 
 def test_a_token_stands_for_its_user(database: Database, ann: UserRecord) -> None:
-    """Until the moment it expires."""
+    """Until it expires."""
     with database.begin() as s:
         token = queries.create_token(s, ann.id, HASH, kind="access", label="mine", expires=10.0, now=1.0)
     with database.reading() as s:
@@ -40,7 +40,7 @@ def test_a_token_stands_for_its_user(database: Database, ann: UserRecord) -> Non
 
 
 def test_a_token_serves_its_kind_only(database: Database, ann: UserRecord) -> None:
-    """A login link is no access token, and a session only where sessions are asked for."""
+    """A login link is no access token, and a session counts only for sessions."""
     with database.begin() as s:
         queries.create_token(s, ann.id, HASH, kind="login", expires=None, now=1.0)
         queries.create_token(s, ann.id, "b" * 64, kind="session", expires=None, now=1.0)
@@ -51,7 +51,6 @@ def test_a_token_serves_its_kind_only(database: Database, ann: UserRecord) -> No
 
 
 def test_a_revoked_token_is_worthless(database: Database, ann: UserRecord) -> None:
-    """At once, and revoking tells whether there was one."""
     with database.begin() as s:
         token = queries.create_token(s, ann.id, HASH, kind="access", expires=None, now=1.0)
         assert queries.revoke_token(s, token)
@@ -61,7 +60,6 @@ def test_a_revoked_token_is_worthless(database: Database, ann: UserRecord) -> No
 
 
 def test_a_login_link_works_once(database: Database, ann: UserRecord) -> None:
-    """Of two threads that use it at once, one gets in; later nobody."""
     with database.begin() as s:
         queries.create_token(s, ann.id, HASH, kind="login", expires=10.0, now=1.0)
     start = threading.Barrier(2)
@@ -83,7 +81,6 @@ def test_a_login_link_works_once(database: Database, ann: UserRecord) -> None:
 
 
 def test_an_expired_login_link_is_worthless(database: Database, ann: UserRecord) -> None:
-    """Nor does an access token serve as one."""
     with database.begin() as s:
         queries.create_token(s, ann.id, HASH, kind="login", expires=10.0, now=1.0)
         queries.create_token(s, ann.id, "b" * 64, kind="access", expires=None, now=1.0)
@@ -92,8 +89,8 @@ def test_an_expired_login_link_is_worthless(database: Database, ann: UserRecord)
         assert queries.principal_by_token(s, "b" * 64, 5.0) is not None
 
 
-def test_a_purge_drops_what_is_of_no_use(database: Database, ann: UserRecord) -> None:
-    """Expired tokens, expired and used codes go; the rest stays."""
+def test_a_purge_deletes_expired_tokens_and_codes(database: Database, ann: UserRecord) -> None:
+    """Expired tokens, and expired and used codes; others stay."""
     key = b"k" * 32
     with database.begin() as s:
         rover, arm = queries.add_robot(s, "rover"), queries.add_robot(s, "arm")
@@ -110,7 +107,6 @@ def test_a_purge_drops_what_is_of_no_use(database: Database, ann: UserRecord) ->
 
 
 def test_tokens_that_cannot_be_are_refused(database: Database, ann: UserRecord) -> None:
-    """A token of nobody, or with a label that isn't one line."""
     with database.begin() as s:
         with pytest.raises(NotFound):
             queries.create_token(s, 99, HASH, kind="access", expires=None, now=1.0)
@@ -121,7 +117,6 @@ def test_tokens_that_cannot_be_are_refused(database: Database, ann: UserRecord) 
 def test_a_session_opens_only_while_the_password_is_the_one_that_was_verified(
     database: Database, ann: UserRecord
 ) -> None:
-    """Changed, disabled or removed meanwhile: refused, and nothing is kept."""
 
     def opens(stored: str | None) -> int:
         with database.begin() as s:

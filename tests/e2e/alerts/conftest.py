@@ -1,21 +1,21 @@
-"""One relay with a receiver of its alerts, without rules and news at the beginning of each test."""
+"""One relay with a webhook receiver; each test starts without rules, alerts and messages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
-from switchboard_hook import Hook
-from switchboard_processes import running
-from switchboard_relay import Relay
 
-from tests.e2e.alerts.house import House
+from tests.worlds.alert_relay import AlertWorld
+from tests.worlds.processes import running
+from tests.worlds.relay_process import Relay
+from tests.worlds.webhook_server import WebhookServer
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """One relay for all."""
-    hook = Hook()
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AlertWorld]:
+    """One relay for all tests."""
+    webhook_receiver = WebhookServer()
     relay = Relay(
         tmp_path_factory.mktemp("alerts"),
         "--webhook-networks",
@@ -23,16 +23,16 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
         "--apprise-schemes",
         "mailto",
     )
-    with running(hook, relay):
-        yield House(relay, hook, relay.user("boss", admin=True), relay.user("viewer"), {})
+    with running(webhook_receiver, relay):
+        yield AlertWorld(relay, webhook_receiver, relay.user("boss", admin=True), relay.user("viewer"), {})
 
 
 @pytest.fixture(autouse=True)
-def clean(house: House) -> Iterator[None]:
-    """No rules and nothing heard before; no robot's words after."""
-    house.hook.got.clear()
-    house.hook.status = 204
+def clean(world: AlertWorld) -> Iterator[None]:
+    """Removes rules and received messages before a test, and the robot's reports after it."""
+    world.webhook_receiver.got.clear()
+    world.webhook_receiver.status = 204
     yield
-    for rule in house.ask("GET", "/rules")["rules"]:
-        house.ask("DELETE", f"/rules/{rule['id']}")
-    assert "Traceback" not in house.relay.log
+    for rule in world.ask("GET", "/rules")["rules"]:
+        world.ask("DELETE", f"/rules/{rule['id']}")
+    assert "Traceback" not in world.relay.log

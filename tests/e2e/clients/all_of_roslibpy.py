@@ -1,6 +1,6 @@
-"""Everything roslibpy can do with ROS 2, once each, against the conformance suite's fixture node.
+"""All features of roslibpy for ROS 2, once each, against the conformance suite's fixture node.
 
-Arguments: websocket URL, access token. Prints what came of it as JSON.
+Arguments: websocket URL, access token. Prints the results as JSON.
 """
 
 import enum
@@ -23,7 +23,7 @@ def service(name, type_name):
 
 
 def fixture(*words):
-    """Ask the fixture node to do something."""
+    """Sends a command to the fixture node."""
     do = service("/conformance/do", "rcl_interfaces/srv/ListParameters")
     return do.call(roslibpy.ServiceRequest({"prefixes": list(words)}), timeout=SECONDS)["result"]["names"]
 
@@ -75,7 +75,7 @@ while heard.empty():
 into.unadvertise()
 out.unsubscribe()
 
-# --- services, both ways ---
+# --- services, in both directions ---
 invert = service("/conformance/invert", "std_srvs/srv/SetBool")
 seen["inverted"] = dict(invert.call(roslibpy.ServiceRequest({"data": True}), timeout=SECONDS))
 invert.call(roslibpy.ServiceRequest({"data": False}), answers.put, answers.put)

@@ -1,4 +1,4 @@
-"""A ROS 2 node that publishes point clouds until it is killed. Arguments: topic and bytes, again and again."""
+"""A ROS 2 node that publishes point clouds until it is killed. Arguments: pairs of topic and bytes."""
 
 import array
 import sys

@@ -1,6 +1,7 @@
-"""A ROS 2 node that serves, calls, acts and pursues with every kind of field. Prints what it saw as JSON lines.
+"""A ROS 2 node with services and actions, as server and client, with every kind of field. Prints its events
+as JSON lines.
 
-Arguments: what to do: ``serve`` (until it is killed), ``call`` a service, or ``send`` a goal; a name.
+Arguments: its task: ``serve`` (until it is killed), ``call`` a service, or ``send`` a goal; a name.
 """
 
 import json
@@ -30,7 +31,7 @@ def nested() -> Nested:
     return message
 
 
-def tell(**what: object) -> None:
+def report(**what: object) -> None:
     print(json.dumps(what), flush=True)
 
 
@@ -42,7 +43,7 @@ def serve(node: object, name: str) -> None:
 
     def pursue(goal: object) -> EverythingAction.Result:
         while not node.count_subscribers(f"{name}/_action/feedback"):
-            time.sleep(0.01)  # who asked may not have been found yet; what is said before that is lost
+            time.sleep(0.01)  # the client may not be discovered yet; earlier messages are lost
         for step in range(goal.request.steps):
             goal.publish_feedback(EverythingAction.Feedback(step=step, feedback=goal.request.goal))
         goal.succeed()
@@ -52,7 +53,7 @@ def serve(node: object, name: str) -> None:
         node.create_service(EverythingService, name, answer),
         ActionServer(node, EverythingAction, name, pursue),
     )
-    tell(ready=True)
+    report(ready=True)
     rclpy.spin(node)
 
 
@@ -64,7 +65,7 @@ def call(node: object, name: str) -> None:
     rclpy.spin_until_future_complete(node, future, timeout_sec=20)
     response = future.result()
     same = response.response == request.request
-    tell(same=same, answers=list(response.answers))
+    report(same=same, answers=list(response.answers))
 
 
 def send(node: object, name: str) -> None:
@@ -74,14 +75,14 @@ def send(node: object, name: str) -> None:
     seen = []
     future = client.send_goal_async(goal, feedback_callback=lambda each: seen.append(each.feedback))
     rclpy.spin_until_future_complete(node, future, timeout_sec=20)
-    # rclpy tells of no more feedback once the result has come, and takes one of each at a time.
+    # rclpy reports no feedback after the result, and accepts one of each at a time.
     until = time.monotonic() + 20
     while len(seen) < goal.steps and time.monotonic() < until:
         rclpy.spin_once(node, timeout_sec=0.1)
     done = future.result().get_result_async()
     rclpy.spin_until_future_complete(node, done, timeout_sec=20)
     result = done.result()
-    tell(
+    report(
         status=result.status,
         same=result.result.result == goal.goal,
         path=list(result.result.path),

@@ -1,4 +1,5 @@
-"""Two unmodified roslibpy users share a robot: one drives, the other asks for control and gets it. Prints JSON.
+"""Two unmodified roslibpy users share a robot: one drives, the other requests control and gets it. Prints
+JSON.
 
 Arguments: websocket URL, access token of the first, of the second.
 """
@@ -14,7 +15,7 @@ url, *tokens = sys.argv[1:]
 
 
 class Peer:
-    """One connection, what it hears of control, and its hand on the stick."""
+    """A connection, its messages about control, and its joystick."""
 
     def __init__(self, token):
         self.ros = roslibpy.Ros(host=url, headers={"Authorization": f"Bearer {token}"})
@@ -46,13 +47,15 @@ class Peer:
 
 
 first, second = (Peer(token) for token in tokens)
-seen = {"free": first.until(lambda told: told["state"] == "free")}
+seen = {"free": first.until(lambda reported: reported["state"] == "free")}
 first.drive(1.0, 0.2)
-seen["held"] = first.until(lambda told: told["holder"] and told["holder"]["you"])
+seen["held"] = first.until(lambda reported: reported["holder"] and reported["holder"]["you"])
 seen["asked"] = second.call("/relay/take_control", why="my turn")
-seen["requested"] = first.until(lambda told: told["request"] and told["request"]["why"] == "my turn")
+seen["requested"] = first.until(
+    lambda reported: reported["request"] and reported["request"]["why"] == "my turn"
+)
 seen["granted"] = first.call("/relay/grant_control")
-seen["handed over"] = second.until(lambda told: told["holder"] and told["holder"]["you"])
+seen["handed over"] = second.until(lambda reported: reported["holder"] and reported["holder"]["you"])
 marked = time.monotonic_ns()
 first.drive(0.5, 0.2)
 second.drive(1.0, -0.2)

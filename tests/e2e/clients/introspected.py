@@ -1,4 +1,4 @@
-"""A ROS 2 node with a service that tells of its calls, an action and a hidden topic. It uses them until killed."""
+"""A ROS 2 node with a service with introspection, an action and a hidden topic. It uses them until killed."""
 
 import rclpy
 from example_interfaces.action import Fibonacci

@@ -1,7 +1,8 @@
-"""The joystick program with a gamepad of SDL that is moved by lines on the standard input.
+"""The joystick program with an SDL gamepad that is moved by lines on the standard input.
 
-``plug``, ``unplug``, ``axis NUMBER VALUE``, ``button NUMBER 0|1``; the arguments are those of the program. The gamepad
-is a virtual joystick of the SDL that pygame brings, which pygame itself does not offer: so all but the device is real.
+``plug``, ``unplug``, ``axis NUMBER VALUE``, ``button NUMBER 0|1``; the arguments are those of the program.
+The gamepad is a virtual joystick of the SDL library that pygame contains, which pygame itself does not offer.
+All but the device is real.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class Hand:
         self._sdl.SDL_JoystickSetVirtualButton(self._pad, int(number), ctypes.c_uint8(int(pressed)))
 
     def obey(self) -> None:
-        """Until the standard input ends."""
+        """Runs commands until the standard input ends."""
         for line in sys.stdin:
             what, *arguments = line.split()
             getattr(self, what)(*arguments)

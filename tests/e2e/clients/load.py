@@ -1,7 +1,7 @@
-"""A ROS 2 node that publishes much: numbered messages on several topics, once somebody subscribes to them.
+"""A ROS 2 node that publishes numbered messages on several topics at a high rate, once they have subscribers.
 
-Arguments: seconds, messages per second on /load/small. Prints SUBSCRIBED when all topics have a subscriber, then
-DONE with what it published, as JSON; stays, so that late joiners find it, until it is ended.
+Arguments: seconds, messages per second on /load/small. Prints SUBSCRIBED when all topics have a subscriber,
+then DONE with the numbers of published messages, as JSON. It runs on for late subscribers until it is ended.
 """
 
 import json
@@ -46,7 +46,7 @@ begun = time.monotonic()
 cpu = time.process_time()
 while (passed := time.monotonic() - begun) < SECONDS:
     for name, (rate, size) in rates.items():
-        # At most a hundredth of a second's worth at once: a process that was held up catches up gently.
+        # At most 10 ms worth of messages at once, so a delayed process catches up slowly.
         for _ in range(min(int(passed * rate) - sent[name], max(1, int(rate / 50)))):
             publish(name, size)
     time.sleep(0.002)

@@ -1,6 +1,7 @@
-"""An unmodified roslibpy user that offers a service and sends goals. Prints what it saw as JSON.
+"""An unmodified roslibpy user that offers a service and sends goals. Prints its results as JSON.
 
-Arguments: websocket URL, access token, the service it offers, an action, an action whose goals are to be cancelled.
+Arguments: websocket URL, access token, the service it offers, an action, an action whose goals are to be
+cancelled.
 """
 
 import json

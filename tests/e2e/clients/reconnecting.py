@@ -1,4 +1,5 @@
-"""An unmodified roslibpy user that stays: prints ODOMETRY and how often it was cut, when odometry comes (again).
+"""An unmodified roslibpy user that stays: prints ODOMETRY and the number of disconnections, when odometry
+arrives (again).
 
 Arguments: websocket URL, access token.
 """
@@ -11,7 +12,7 @@ import roslibpy
 url, token = sys.argv[1:]
 ros = roslibpy.Ros(host=url, headers={"Authorization": f"Bearer {token}"})
 cuts = 0
-told = -1
+reported = -1
 
 
 def on_close(_):
@@ -20,9 +21,9 @@ def on_close(_):
 
 
 def on_odom(_):
-    global told
-    if told < cuts:
-        told = cuts
+    global reported
+    if reported < cuts:
+        reported = cuts
         print(f"ODOMETRY {cuts}", flush=True)
 
 

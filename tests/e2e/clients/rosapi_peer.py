@@ -1,4 +1,5 @@
-"""Two ROS 2 nodes: parameters, topics, services and actions of types no relay has seen. The second is for the denied.
+"""Two ROS 2 nodes: parameters, topics, services and actions of types unknown to any relay. Names of the
+second are denied.
 
 They run until they are killed.
 """

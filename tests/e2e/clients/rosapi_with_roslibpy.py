@@ -1,7 +1,7 @@
-"""An unmodified roslibpy calls services of rosapi, and uses its own helpers for parameters and time.
+"""An unmodified roslibpy user calls services of rosapi, and roslibpy's helpers for parameters and time.
 
-Arguments: websocket URL, access token, calls as JSON (service, type, arguments), parameters as JSON (name, new value).
-Prints the answers as JSON.
+Arguments: websocket URL, access token, calls as JSON (service, type, arguments), parameters as JSON (name,
+new value). Prints the answers as JSON.
 """
 
 import json

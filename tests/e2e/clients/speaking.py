@@ -1,9 +1,7 @@
-"""ROS 2 nodes told by lines of JSON on stdin what to publish and to subscribe to; they tell what comes on stdout.
+"""ROS 2 nodes that publish and subscribe by lines of JSON on stdin; they print received messages on stdout.
 
-["publish", node, topic, {"depth": 1, "durability": "transient_local", …}, [texts]]
-["subscribe", node, topic, {…}]
-["serve", node, service, {…}]
-["end", node]
+["publish", node, topic, {"depth": 1, "durability": "transient_local", …}, [texts]] ["subscribe", node, topic,
+{…}] ["serve", node, service, {…}] ["end", node]
 """
 
 import json
@@ -40,18 +38,18 @@ jobs: list[list[object]] = []
 lock = threading.Lock()
 
 
-def tell(**what: object) -> None:
+def report(**what: object) -> None:
     with lock:
         print(json.dumps(what), flush=True)
 
 
-def profile(wishes: dict[str, object]) -> QoSProfile:
-    made = QoSProfile(depth=wishes.get("depth", 1))
-    for name, wish in wishes.items():
+def profile(options: dict[str, object]) -> QoSProfile:
+    made = QoSProfile(depth=options.get("depth", 1))
+    for name, value in options.items():
         if name in WORDS:
-            setattr(made, name, WORDS[name][wish.upper()])
+            setattr(made, name, WORDS[name][value.upper()])
         elif name in TIMES:
-            setattr(made, name, Duration(nanoseconds=int(wish * 1e9)))
+            setattr(made, name, Duration(nanoseconds=int(value * 1e9)))
     return made
 
 
@@ -62,35 +60,37 @@ def node(name: str) -> Node:
     return nodes[name]
 
 
-def publish(name: str, topic: str, wishes: dict[str, object], texts: list[str]) -> None:
+def publish(name: str, topic: str, options: dict[str, object], texts: list[str]) -> None:
     if (name, topic) not in ends:
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
-        ends[name, topic] = node(name).create_publisher(String, topic, profile(wishes), event_callbacks=quiet)
+        ends[name, topic] = node(name).create_publisher(
+            String, topic, profile(options), event_callbacks=quiet
+        )
     for text in texts:
         ends[name, topic].publish(String(data=text))
 
 
-def subscribe(name: str, topic: str, wishes: dict[str, object]) -> None:
-    kind = Twist if wishes.get("kind") == "twist" else String
+def subscribe(name: str, topic: str, options: dict[str, object]) -> None:
+    kind = Twist if options.get("kind") == "twist" else String
 
-    def heard(message: object) -> None:
-        tell(node=name, topic=topic, text=message.data if kind is String else str(message.linear.x))
+    def received(message: object) -> None:
+        report(node=name, topic=topic, text=message.data if kind is String else str(message.linear.x))
 
     ends[name, topic] = node(name).create_subscription(
         kind,
         topic,
-        heard,
-        profile(wishes),
+        received,
+        profile(options),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
     )
 
 
-def serve(name: str, service: str, wishes: dict[str, object]) -> None:
+def serve(name: str, service: str, options: dict[str, object]) -> None:
     def answer(request: object, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = True, name
         return response
 
-    ends[name, service] = node(name).create_service(Trigger, service, answer, qos_profile=profile(wishes))
+    ends[name, service] = node(name).create_service(Trigger, service, answer, qos_profile=profile(options))
 
 
 def end(name: str) -> None:
@@ -109,7 +109,7 @@ def read() -> None:
 
 
 threading.Thread(target=read, daemon=True).start()
-tell(ready=True)
+report(ready=True)
 while True:
     executor.spin_once(timeout_sec=0.05)
     while jobs:
@@ -119,4 +119,4 @@ while True:
             rclpy.try_shutdown()
             sys.exit(0)
         globals()[name](*arguments)
-        tell(done=name)
+        report(done=name)

@@ -1,4 +1,4 @@
-"""A ROS 2 node that publishes on a topic until it is told to end. Arguments: topic, type, `reliable` or `latched`."""
+"""A ROS 2 node that publishes on a topic until it is ended. Arguments: topic, type, `reliable` or `latched`."""
 
 import importlib
 import signal
@@ -20,7 +20,7 @@ stop = False
 
 
 def end(*_: object) -> None:
-    """Leave the loop, so that others hear of the end at once."""
+    """Leaves the loop, so that the graph learns of the end at once."""
     global stop
     stop = True
 

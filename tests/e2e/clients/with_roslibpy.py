@@ -1,4 +1,4 @@
-"""An unmodified roslibpy user: lists, subscribes, drives, calls. Prints what it saw as JSON.
+"""An unmodified roslibpy user: lists, subscribes, drives, calls. Prints its results as JSON.
 
 Arguments: websocket URL, access token.
 """
@@ -44,7 +44,7 @@ seen["odom"] = first_odom.wait(20)
 command = roslibpy.Topic(ros, "/cmd_vel", "geometry_msgs/Twist")
 begun = time.monotonic()
 while not moved.is_set() and time.monotonic() < begun + 60:
-    # Who began to drive while another still had control, or was late, moves nothing until he has let go for a while.
+    # Commands that began under another controller, or were late, are refused until a pause.
     if (time.monotonic() - begun) % (STROKE + PAUSE) < STROKE:
         command.publish(roslibpy.Message({"linear": {"x": 0.3}}))
     moved.wait(0.1)

@@ -1,4 +1,4 @@
-"""What docs/alerts.md shows works as it stands."""
+"""The examples of docs/guides/alerts.md work as they are printed."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from relay_server.alerts.email import PARAMETERS
+from relay_server.alerts.apprise import PARAMETERS
 from relay_server.alerts.webhook import signature
-from tests.relay_server.alerts.made_up import SECRET
+from tests.worlds.alerts import SECRET
 
-PAGE = Path(__file__).parents[3] / "docs" / "alerts.md"
+PAGE = Path(__file__).parents[3] / "docs/guides/alerts.md"
 
 
-def test_the_receiver_of_the_page_knows_what_is_genuine() -> None:
-    """Neither another body nor another secret nor an old message passes."""
+def test_the_documented_receiver_checks_signatures() -> None:
     (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     shown: dict[str, Any] = {}
     exec(code, shown)  # a page of this repository
@@ -32,6 +31,5 @@ def test_the_receiver_of_the_page_knows_what_is_genuine() -> None:
 
 
 def test_the_page_names_the_services_that_can_be_allowed() -> None:
-    """All of them, and no others."""
     (listed,) = re.findall(r"These can be allowed: (.*?)\. ", PAGE.read_text(), re.DOTALL)
     assert re.findall(r"`(\w+)`", listed) == list(PARAMETERS)

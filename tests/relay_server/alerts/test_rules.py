@@ -1,4 +1,4 @@
-"""What a rule tells, when it is quiet, and what of it may be seen."""
+"""What a rule reports, when it is quiet, and which details may be shown."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHANNELS = ("portal", "webhook", "apprise")
 
 
 def at(text: str, zone: str = "Europe/Rome") -> float:
-    """Unix time of a clock on a wall there."""
+    """Unix time of a wall clock in this time zone."""
     return datetime.fromisoformat(text).replace(tzinfo=ZoneInfo(zone)).timestamp()
 
 
@@ -42,18 +42,19 @@ def at(text: str, zone: str = "Europe/Rome") -> float:
         ({"kinds": ("offline",)}, AlertEvent.BEGUN, False),
         ({"level": "error"}, AlertEvent.BEGUN, False),
         ({"level": "info"}, AlertEvent.BEGUN, True),
-        ({"over": False}, AlertEvent.OVER, False),
-        ({"over": False}, AlertEvent.WORSE, True),
-        ({"over": True}, AlertEvent.OVER, True),
+        ({"notify_end": False}, AlertEvent.OVER, False),
+        ({"notify_end": False}, AlertEvent.WORSE, True),
+        ({"notify_end": True}, AlertEvent.OVER, True),
     ],
 )
-def test_a_rule_tells_what_it_is_for(change: dict[str, object], event: AlertEvent, wanted: bool) -> None:
-    """By robot, kind, level, and whether it is over."""
+def test_a_rule_applies_to_its_robots_kinds_and_levels(
+    change: dict[str, object], event: AlertEvent, wanted: bool
+) -> None:
     assert rules.wants(RULE._replace(**change), ALERT, event, {ALERT.realm}) is wanted  # type: ignore[arg-type]  # its fields
 
 
-def test_a_rule_tells_nothing_of_another_realms_robots() -> None:
-    """Their names may be the same; one that is shared with its realm is one of it."""
+def test_a_rule_does_not_apply_to_robots_of_other_realms() -> None:
+    """Their names may be the same. A robot shared with the realm counts as the realm's robot."""
     theirs = RULE._replace(realm="lab1", robots="cleaner-7")
     assert not rules.wants(theirs, ALERT, AlertEvent.BEGUN, {ALERT.realm})
     assert rules.wants(theirs, ALERT, AlertEvent.BEGUN, {ALERT.realm, "lab1"})
@@ -78,7 +79,6 @@ def test_quiet_hours_may_go_over_midnight(now: str, end: str | None) -> None:
 
 
 def test_quiet_hours_within_a_day_are_of_the_rules_zone() -> None:
-    """Noon in Tokyo is not noon in Rome."""
     rule = RULE._replace(quiet={"from": "12:00", "to": "13:30", "zone": "Asia/Tokyo", "least": "none"})
     assert rules.quiet_until(rule, at("2026-05-01 12:10", "Asia/Tokyo")) == at(
         "2026-05-01 13:30", "Asia/Tokyo"
@@ -87,7 +87,7 @@ def test_quiet_hours_within_a_day_are_of_the_rules_zone() -> None:
 
 
 def test_quiet_hours_end_when_clocks_are_changed() -> None:
-    """An end that does not exist that night, or exists twice, comes all the same, and only once."""
+    """An end that the change of clocks skips or repeats comes exactly once."""
     spring = RULE._replace(quiet={**NIGHT, "to": "02:30"})
     before = at("2026-03-29 01:59:00")
     end = rules.quiet_until(spring, before)
@@ -99,7 +99,7 @@ def test_quiet_hours_end_when_clocks_are_changed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("least", "level", "told"),
+    ("least", "level", "reported"),
     [
         ("error", "error", True),
         ("error", "warning", False),
@@ -107,10 +107,10 @@ def test_quiet_hours_end_when_clocks_are_changed() -> None:
         ("none", "error", False),
     ],
 )
-def test_the_worst_is_told_in_quiet_hours_too(least: str, level: str, told: bool) -> None:
-    """Unless nothing is to be."""
+def test_the_worst_level_is_sent_in_quiet_hours(least: str, level: str, reported: bool) -> None:
+    """Unless the rule forbids it."""
     rule, alert = RULE._replace(quiet={**NIGHT, "least": least}), ALERT._replace(level=level)
-    assert rules.passes(rule, alert, at("2026-11-22 23:00")) is told
+    assert rules.passes(rule, alert, at("2026-11-22 23:00")) is reported
     assert rules.passes(rule, alert, at("2026-11-22 12:00"))
 
 
@@ -125,38 +125,42 @@ def test_the_worst_is_told_in_quiet_hours_too(least: str, level: str, told: bool
     ],
 )
 def test_rules_that_make_sense_are_taken(ask: RuleRequest) -> None:
-    """Each channel has what it needs."""
+    """Each channel has the fields it needs."""
     rules.check(ask, CHANNELS)
 
 
 @pytest.mark.parametrize(
     ("ask", "words"),
     [
-        (RuleRequest("pager"), "'channel' is one of"),
-        (RuleRequest("portal", level="fatal"), "'level' is one of"),
-        (RuleRequest("portal", url="https://example.org"), "leave it out with the channel 'portal'"),
-        (RuleRequest("webhook"), "'url' says where"),
-        (RuleRequest("apprise", url="mailtos://x", secret="0123456789abcdef"), "'secret' goes with"),
+        (RuleRequest("pager"), "'channel' must be one of"),
+        (RuleRequest("portal", level="fatal"), "'level' must be one of"),
+        (RuleRequest("portal", url="https://example.org"), "the channel 'portal' takes none"),
+        (RuleRequest("webhook"), "'url' is the address"),
+        (RuleRequest("apprise", url="mailtos://x", secret="0123456789abcdef"), "'secret' is only for"),
         (RuleRequest("webhook", url="https://x", secret="short"), "16 to 128"),
         (RuleRequest("webhook", url="https://x", secret="0123456789abcdef\n"), "printable"),
-        (RuleRequest("portal", label="a\nb"), "printable lines"),
-        (RuleRequest("portal", robots="a\x00b"), "printable lines"),
-        (RuleRequest("portal", robots="r*@lab1"), "'r.@lab1' must be written without '@'"),
-        (RuleRequest("portal", quiet=Quiet("08:00", "08:00")), "are the same"),
+        (RuleRequest("portal", label="a\nb"), "must be printable, each on one line"),
+        (RuleRequest("portal", robots="a\x00b"), "must be printable, each on one line"),
+        (RuleRequest("portal", robots="r*@lab1"), "write 'r.@lab1' without '@'"),
+        (RuleRequest("portal", quiet=Quiet("08:00", "08:00")), "must differ"),
         (RuleRequest("portal", quiet=Quiet("08:00", "09:00", least="all")), "'least'"),
-        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", "Mars/Olympus")), "no time zone"),
-        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", "../../etc/passwd")), "no time zone"),
-        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", "Europe")), "no time zone"),
+        (
+            RuleRequest("portal", quiet=Quiet("08:00", "09:00", "Mars/Olympus")),
+            "the time zone '.*' is unknown",
+        ),
+        (
+            RuleRequest("portal", quiet=Quiet("08:00", "09:00", "../../etc/passwd")),
+            "the time zone '.*' is unknown",
+        ),
+        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", "Europe")), "the time zone '.*' is unknown"),
     ],
 )
-def test_rules_that_make_none_are_refused_in_words(ask: RuleRequest, words: str) -> None:
-    """Each says what is wrong."""
+def test_invalid_rules_are_refused_with_a_reason(ask: RuleRequest, words: str) -> None:
     with pytest.raises(Invalid, match=words):
         rules.check(ask, CHANNELS)
 
 
 def test_a_channel_that_is_switched_off_is_refused() -> None:
-    """Whoever asks is told who can switch it on."""
     with pytest.raises(Invalid, match="administrator"):
         rules.check(RuleRequest("apprise", url="mailtos://x"), ("portal", "webhook"))
 
@@ -174,7 +178,7 @@ def test_a_channel_that_is_switched_off_is_refused() -> None:
     ],
 )
 def test_bodies_of_another_form_are_refused(body: bytes) -> None:
-    """Ranges, clocks and unknown fields are judged as they are read."""
+    """Ranges, clocks and unknown fields are checked while the body is read."""
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(body, type=RuleRequest)
 
@@ -190,7 +194,7 @@ def test_bodies_of_another_form_are_refused(body: bytes) -> None:
     ],
 )
 def test_of_an_address_nothing_is_shown_that_could_be_secret(channel: str, url: str, shown: str) -> None:
-    """Paths and apprise's URLs carry passwords."""
+    """Paths and URLs of apprise may contain passwords."""
     assert rules.shown_url(RULE._replace(channel=channel, url=url)) == shown
 
 
@@ -205,8 +209,8 @@ def test_of_an_address_nothing_is_shown_that_could_be_secret(channel: str, url: 
         (("subscribe:/diagnostics",), "module", "camera", True),
     ],
 )
-def test_who_may_not_hear_a_topic_does_not_hear_of_it(
+def test_alerts_about_topics_need_the_right_to_subscribe(
     deny: tuple[str, ...], kind: str, about: str, seen: bool
 ) -> None:
-    """Its name is not for everybody, nor what it says."""
+    """Both the topic's name and the alert's text need it."""
     assert rules.visible(Rules([Grant(Level.VIEWER, deny=deny)]), kind, about) is seen

@@ -1,4 +1,4 @@
-"""The command line run in this process on a data folder of its own, and a stand-in for a running relay."""
+"""The command line in this process with a data folder of its own, and a fake of a running relay."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from relay_server.cli import main
+from tests.worlds.empty_database import write_empty_database
 
 PASSWORD = "correct horse"
 
@@ -29,34 +30,41 @@ class Cli:
         self.data = data
 
     def __call__(self, *arguments: str, stdin: str | None = None, **environment: str) -> Result:
-        """Run a command, whatever comes of it."""
+        """Runs a command with any result."""
         env = {"SWITCHBOARD_DATA": str(self.data), "SWITCHBOARD_DB": None, **environment}
         return CliRunner(env=env).invoke(main, arguments, input=stdin)
 
     def ok(self, *arguments: str, stdin: str | None = None) -> str:
-        """Run a command that must succeed; what it prints."""
+        """Runs a command that must succeed; returns its output."""
         result = self(*arguments, stdin=stdin)
         assert (result.exit_code, result.stderr) == (0, ""), result.output
         return result.stdout
 
     def json(self, *arguments: str, stdin: str | None = None) -> Any:
-        """Run a command with --json; what it answers."""
+        """Runs a command with --json; returns its answer."""
         return json.loads(self.ok(*arguments, "--json", stdin=stdin))
 
     def fails(self, *arguments: str, stdin: str | None = None, code: int = 1) -> str:
-        """Run a command that must fail; the sentence, of which nothing is on stdout."""
+        """Runs a command that must fail; returns the error. stdout must be empty."""
         result = self(*arguments, stdin=stdin)
         assert (result.exit_code, result.stdout) == (code, ""), result.output
         return result.stderr
 
     def user(self, name: str, *options: str) -> None:
-        """Add a user with the password of these tests."""
+        """Adds a user with the password of these tests."""
         self.ok("user", "add", name, "--password-stdin", *options, stdin=f"{PASSWORD}\n")
 
 
 @pytest.fixture
+def new_cli(tmp_path: Path) -> Cli:
+    """The command line with a data folder that is not there yet."""
+    return Cli(tmp_path / "data")
+
+
+@pytest.fixture
 def cli(tmp_path: Path) -> Cli:
-    """The command line on an empty place."""
+    """The command line with a data folder whose database has all tables."""
+    write_empty_database(tmp_path / "data" / "switchboard.db")
     return Cli(tmp_path / "data")
 
 
@@ -65,12 +73,12 @@ class FakeRelay(socketserver.ThreadingUnixStreamServer):
 
     :ivar asked: requests so far, as ``METHOD /path``
     :ivar answer: status code and body for ``GET /status``
-    :ivar ordered: bodies of ``POST /fleet``, ``/stop`` and ``/resume`` so far
-    :ivar sent: when these say that they were sent
+    :ivar ordered: bodies of ``POST /fleet``, ``/stop``, ``/resume`` and ``/modules`` so far
+    :ivar sent: their sending times
     :ivar lines: status code and body for the first of these
     :ivar motion: the same for the others; status 0 hangs up
     :ivar may_answer: while this is not set the others have no answer
-    :ivar gone: nobody is there any more to have one
+    :ivar gone: the client has closed the connection
     """
 
     daemon_threads = True
@@ -101,7 +109,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.asked.append(f"{self.command} {self.path}")
         status, body = self.server.answer if self.command == "GET" else (204, b"")
         path, _, _ = self.path.partition("?")
-        if path in ("/fleet", "/stop", "/resume"):
+        if path in ("/fleet", "/stop", "/resume", "/modules"):
             length = int(self.headers["Content-Length"])
             self.server.ordered.append(json.loads(self.rfile.read(length)))
             self.server.sent.append(int(self.headers["Switchboard-Sent"]))
@@ -120,7 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def start_relay() -> Iterator[Callable[[Path], FakeRelay]]:
-    """Starts stand-ins that listen in a folder."""
+    """Starts fake relays that listen in a folder."""
     running: list[tuple[FakeRelay, threading.Thread]] = []
 
     def start(folder: Path) -> FakeRelay:
@@ -142,18 +150,19 @@ def start_relay() -> Iterator[Callable[[Path], FakeRelay]]:
 
 @pytest.fixture
 def short_folder() -> Iterator[Path]:
-    """A folder whose path leaves room for a socket's name."""
+    """A folder with a path short enough for a socket's name."""
     with tempfile.TemporaryDirectory(prefix="sb-") as folder:
         yield Path(folder)
 
 
 @pytest.fixture
 def relay(short_folder: Path, start_relay: Callable[[Path], FakeRelay]) -> FakeRelay:
-    """A relay that runs on the data folder of :func:`live`."""
+    """A running relay on the data folder of :func:`live`."""
     return start_relay(short_folder)
 
 
 @pytest.fixture
 def live(relay: FakeRelay, short_folder: Path) -> Cli:
     """The command line on the data folder of a running relay."""
+    write_empty_database(short_folder / "switchboard.db")
     return Cli(short_folder)

@@ -15,7 +15,7 @@ from relay_server.config import RelaySettings
 
 @pytest.fixture
 def people(cli: Any) -> Any:
-    """User ann; robot rover with an alert that lasts and one that is over."""
+    """User ann; robot rover with an open alert and an ended one."""
     cli.ok("user", "add", "ann", "--no-password")
     cli.ok("robot", "add", "rover")
     database = Database(f"sqlite:///{cli.data / 'switchboard.db'}")
@@ -45,7 +45,6 @@ def people(cli: Any) -> Any:
 
 
 def test_alerts_are_listed_and_acknowledged(people: Any) -> None:
-    """By state and robot; who acknowledges is on record."""
     assert [each["id"] for each in people.json("alerts", "list")] == ["b2", "a1"]
     assert [each["id"] for each in people.json("alerts", "list", "--open", "--robot", "rover")] == ["a1"]
     assert "\x1b" not in people.ok("alerts", "list")
@@ -66,7 +65,7 @@ def test_alerts_are_listed_and_acknowledged(people: Any) -> None:
 def test_alerts_of_batteries_are_switched_off_by_a_low_charge_of_nothing(
     cli: Any, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], low: float, critical: float
 ) -> None:
-    """Whatever is critical otherwise."""
+    """Critical levels do not matter then."""
     began: list[RelaySettings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: began.append(settings))
     monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
@@ -75,7 +74,6 @@ def test_alerts_of_batteries_are_switched_off_by_a_low_charge_of_nothing(
 
 
 def test_networks_are_allowed_and_denied_by_name(cli: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A list of each."""
     began: list[RelaySettings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: began.append(settings))
     monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
@@ -89,12 +87,16 @@ def test_rules_are_added_listed_and_removed(people: Any) -> None:
     """A secret is printed once, an address never again."""
     made = people.json(
         "alerts", "rules", "add", "ann", "--webhook", "https://example.org/secret/path", "--kind", "offline",
-        "--robots", "r*", "--level", "error", "--group", "5", "--quiet", "22:00-07:00@Europe/Rome", "--no-over",
+        "--robots", "r*", "--level", "error", "--group", "5", "--quiet", "22:00-07:00@Europe/Rome", "--no-end",
     )  # fmt: skip
     assert len(made.pop("secret")) >= 32
     (listed,) = people.json("alerts", "rules", "list", "--user", "ann")
     assert listed == made
-    assert (listed["url"], listed["kinds"], listed["over"]) == ("https://example.org/…", ["offline"], False)
+    assert (listed["url"], listed["kinds"], listed["notify_end"]) == (
+        "https://example.org/…",
+        ["offline"],
+        False,
+    )
     assert listed["quiet"] == {"from": "22:00", "to": "07:00", "zone": "Europe/Rome", "least": "error"}
     url = "mailtos://ann:password@example.org"
     assert "password" not in people.ok("alerts", "rules", "add", "ann", "--apprise", stdin=f"{url}\n")
@@ -108,7 +110,7 @@ def test_rules_are_added_listed_and_removed(people: Any) -> None:
 
 
 def test_a_users_own_realm_is_left_out_of_the_robots_of_a_rule(people: Any) -> None:
-    """However it is written; the pattern is of names as they are in that realm."""
+    """Any spelling of the realm works. The pattern matches names as seen in that realm."""
     people.ok("realm", "add", "lab1")
     people.ok("user", "add", "ann@lab1", "--no-password")
     for user, robots in (("ann", "r*@default"), ("ann@lab1", "r*@LAB1"), ("ann@lab1", "r*")):
@@ -123,19 +125,16 @@ def test_a_users_own_realm_is_left_out_of_the_robots_of_a_rule(people: Any) -> N
     ("options", "words"),
     [
         (("--portal", "--robots", "r*@lab1"), "'r*@lab1' are robots of another realm"),
-        (("--portal", "--robots", "@default"), "this is no rule"),
+        (("--portal", "--robots", "@default"), "this is not a valid rule"),
         ((), "give one of"),
         (("--portal", "--webhook", "https://example.org"), "give one of"),
         (("--webhook", "ftp://example.org"), "webhook's 'url'"),
-        (("--portal", "--quiet", "night"), "are no hours"),
-        (("--portal", "--quiet", "22:00-07:00@Mars"), "no time zone"),
-        (("--portal", "--quiet", "22-7"), "this is no rule"),
-        (("--portal", "--group", "1"), "this is no rule"),
+        (("--portal", "--quiet", "night"), "is not a span of hours"),
+        (("--portal", "--quiet", "22:00-07:00@Mars"), "is unknown"),
+        (("--portal", "--quiet", "22-7"), "this is not a valid rule"),
+        (("--portal", "--group", "1"), "this is not a valid rule"),
     ],
 )
-def test_rules_that_make_no_sense_are_refused_in_words(
-    people: Any, options: tuple[str, ...], words: str
-) -> None:
-    """And nothing is kept."""
+def test_invalid_rules_are_refused_with_a_reason(people: Any, options: tuple[str, ...], words: str) -> None:
     assert words in people.fails("alerts", "rules", "add", "ann", *options)
     assert people.json("alerts", "rules", "list") == []

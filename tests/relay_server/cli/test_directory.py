@@ -14,7 +14,7 @@ from relay_db.engine import Database
 
 @pytest.fixture
 def entries(cli: Any) -> Any:
-    """Ann has registered two things, one about rover, and one whose lease is over."""
+    """Ann has registered two entries, one about rover, and one with an expired lease."""
     cli.user("ann")
     cli.ok("robot", "add", "rover")
     database = Database(f"sqlite:///{cli.data / 'switchboard.db'}")
@@ -33,11 +33,10 @@ def entries(cli: Any) -> Any:
     return cli
 
 
-def test_what_is_registered_is_listed(entries: Any) -> None:
-    """By kind and robot; not what is over."""
+def test_registered_entries_are_listed(entries: Any) -> None:
     assert [each["id"] for each in entries.json("directory")] == ["a1", "a2"]
-    (told,) = entries.json("directory", "--kind", "application")
-    assert {name: told[name] for name in ("name", "robot", "address", "user", "data", "ttl")} == {
+    (reported,) = entries.json("directory", "--kind", "application")
+    assert {name: reported[name] for name in ("name", "robot", "address", "user", "data", "ttl")} == {
         "name": "map",
         "robot": None,
         "address": "http://a/",
@@ -53,7 +52,7 @@ def test_what_is_registered_is_listed(entries: Any) -> None:
 
 
 def test_an_entry_is_removed_once(entries: Any) -> None:
-    """With an entry in the audit log and an event; a relay that runs takes it up."""
+    """It makes an audit entry and an event; a running relay applies it."""
     assert entries.json("directory", "remove", "a2", "--yes") == {"id": "a2", "removed": True}
     assert [each["id"] for each in entries.json("directory")] == ["a1"]
     for id in ("a2", "a3", "nobody's"):
@@ -73,7 +72,6 @@ def test_an_entry_is_removed_once(entries: Any) -> None:
 
 
 def test_its_help_shows_examples(cli: Any) -> None:
-    """Of all it does."""
     shown = cli.ok("directory", "--help")
     assert "switchboard directory --robot rover" in shown and "remove" in shown
     assert "switchboard directory remove" in cli.ok("directory", "remove", "--help")

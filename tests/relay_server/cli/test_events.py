@@ -25,7 +25,7 @@ def write(cli: Any, *new_ones: queries.NewStoredEvent) -> None:
     """As a relay does."""
     database = Database(f"sqlite:///{cli.data / 'switchboard.db'}")
     with database.begin() as s:
-        queries.remember(s, new_ones)
+        queries.store_events(s, new_ones)
     database.close()
 
 
@@ -43,7 +43,6 @@ def memory(cli: Any) -> Any:
 
 
 def test_events_are_listed_the_latest_last(memory: Any) -> None:
-    """By names and their beginnings; nothing in them moves a cursor."""
     kinds = ["robot.online", "=greeted", "client.joined"]
     assert [each["kind"] for each in memory.json("events")] == kinds
     assert memory.json("events", "--source", "app") == [
@@ -55,7 +54,7 @@ def test_events_are_listed_the_latest_last(memory: Any) -> None:
             "user": "ann",
             "at": 20.0,
             "data": {"who": "bob"},
-            "used": 0,
+            "use_count": 0,
         }
     ]
     assert [each["kind"] for each in memory.json("events", "--robot", "r*", "--limit", "1")] == kinds[2:]
@@ -66,7 +65,7 @@ def test_events_are_listed_the_latest_last(memory: Any) -> None:
 
 
 def test_events_are_written_as_a_table(memory: Any) -> None:
-    """The newest first, without formulas, as many as were asked for."""
+    """Newest first, without formulas, as many as requested."""
     rows = list(csv.DictReader(io.StringIO(memory.ok("events", "--csv", "--limit", "2"))))
     assert [(row["id"], row["kind"], row["robot"]) for row in rows] == [
         ("3", "client.joined", "rover"),
@@ -78,14 +77,13 @@ def test_events_are_written_as_a_table(memory: Any) -> None:
     "options",
     [("--csv", "--json"), ("--csv", "--follow"), ("--kind", "*x"), ("--last", "soon"), ("--last", "0")],
 )
-def test_what_makes_no_sense_is_refused(memory: Any, options: tuple[str, ...]) -> None:
-    """In words."""
+def test_invalid_requests_are_refused(memory: Any, options: tuple[str, ...]) -> None:
     assert memory.fails("events", *options)
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_what_is_new_follows(memory: Any, monkeypatch: pytest.MonkeyPatch, as_json: bool) -> None:
-    """Until Ctrl-C, an event a line."""
+def test_new_events_follow(memory: Any, monkeypatch: pytest.MonkeyPatch, as_json: bool) -> None:
+    """One event per line until Ctrl-C."""
     turns = iter([lambda: write(memory, new(40.0, "app", "x"), new(50.0, "other", "y"))])
 
     def sleep(seconds: float) -> None:

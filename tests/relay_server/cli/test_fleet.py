@@ -14,10 +14,10 @@ FAILED = {**OK, "ok": False, "message": "robot tank is offline"}
 def lines(
     *results: dict[str, Any], robots: int | None = None, unmatched: tuple[str, ...] = ()
 ) -> tuple[int, bytes]:
-    """What the relay answers."""
+    """The relay's answer."""
     names = [str(each["robot"]) for each in results] + ["more"] * ((robots or len(results)) - len(results))
-    told = [{"do": "call", "robots": names, "unmatched": list(unmatched)}, *results]
-    return 200, b"".join(json.dumps(each).encode() + b"\n" for each in told)
+    reported = [{"do": "call", "robots": names, "unmatched": list(unmatched)}, *results]
+    return 200, b"".join(json.dumps(each).encode() + b"\n" for each in reported)
 
 
 @pytest.mark.parametrize(
@@ -64,15 +64,16 @@ def lines(
 def test_an_order_goes_to_the_relay(
     live: Any, relay: Any, arguments: tuple[str, ...], order: dict[str, Any]
 ) -> None:
-    """As it was written."""
     relay.lines = lines({"robot": "rover", **OK})
     live.ok("robot", *arguments)
-    assert relay.ordered == [{"timeout": 10.0, **order}]
+    (ordered,) = relay.ordered
+    assert ("stop_id" in ordered) is (order["do"] == "stop")
+    ordered.pop("stop_id", None)
+    assert ordered == {"timeout": 10.0, **order}
     assert relay.asked == ["POST /fleet?realm=default"]
 
 
-def test_each_robot_is_told_of(live: Any, relay: Any) -> None:
-    """What it answered, or why it failed; programs get the relay's words."""
+def test_robots_have_a_row(live: Any, relay: Any) -> None:
     answered = {**OK, "values": {"sum": 7}}
     relay.lines = lines({"robot": "tank", **OK, "message": "on my way"}, {"robot": "rover", **answered})
     shown = live.ok("robot", "call", "*", "/add")
@@ -81,27 +82,25 @@ def test_each_robot_is_told_of(live: Any, relay: Any) -> None:
         ["tank", "ok", "0.25", "s", "on my way"],
     ]
     assert shown.splitlines()[-1] == "Done on 2 of 2."
-    told = live.json("robot", "call", "*", "/add")
-    assert (told["whole"], told["unmatched"], len(told["results"])) == (True, [], 2)
+    reported = live.json("robot", "call", "*", "/add")
+    assert (reported["whole"], reported["unmatched"], len(reported["results"])) == (True, [], 2)
 
 
-def test_a_stop_that_may_have_missed_robots_says_so(live: Any, relay: Any) -> None:
-    """And fails, as one that failed on a robot."""
+def test_a_stop_that_may_have_missed_robots_is_reported(live: Any, relay: Any) -> None:
     head = {"do": "stop", "robots": ["rover"], "unmatched": [], "missed": "the database has not answered"}
     relay.lines = 200, b"\n".join(json.dumps(each).encode() for each in (head, {"robot": "rover", **OK}))
     result = live("robot", "stop", "*")
     assert result.exit_code == 1
-    assert "There may be more robots that are meant: the database has not answered." in result.stdout
+    assert "The order may be meant for more robots: the database has not answered." in result.stdout
     assert json.loads(live("robot", "stop", "*", "--json").stdout)["missed"] == head["missed"]
 
 
-def test_what_failed_anywhere_is_exit_code_1(live: Any, relay: Any) -> None:
-    """And so is a pattern that means nothing, and an answer that is not whole."""
+def test_a_failure_on_any_robot_is_exit_code_1(live: Any, relay: Any) -> None:
     cases = [
         (lines({"robot": "rover", **OK}, {"robot": "tank", **FAILED}), "robot tank is offline"),
-        (lines({"robot": "rover", **OK}, unmatched=("claener-*",)), "No robot is meant by 'claener-*'."),
-        (lines({"robot": "rover", **OK}, robots=3), "Of 2 nothing is known"),
-        ((200, lines({"robot": "rover", **OK}, robots=2)[1] + b"no json\n"), "answered something else"),
+        (lines({"robot": "rover", **OK}, unmatched=("claener-*",)), "'claener-*' matches no robot."),
+        (lines({"robot": "rover", **OK}, robots=3), "For 2 robots the result is not known"),
+        ((200, lines({"robot": "rover", **OK}, robots=2)[1] + b"no json\n"), "sent an unexpected answer"),
     ]
     for answer, words in cases:
         relay.lines = answer
@@ -117,29 +116,27 @@ def test_what_failed_anywhere_is_exit_code_1(live: Any, relay: Any) -> None:
         (404, {"detail": "the order means no robot"}, 1, "the order means no robot"),
         (400, {"detail": "'call' needs 'service'"}, 1, "'call' needs 'service'"),
         (503, {"detail": "too many orders"}, 3, "too many orders"),
-        (500, [], 3, "answered something else (HTTP 500)"),
+        (500, [], 3, "sent an unexpected answer (HTTP 500)"),
     ],
 )
-def test_a_refusal_is_told(live: Any, relay: Any, status: int, body: Any, code: int, words: str) -> None:
-    """In the relay's words."""
+def test_a_refusal_is_printed(live: Any, relay: Any, status: int, body: Any, code: int, words: str) -> None:
     relay.lines = (status, json.dumps(body).encode())
     assert words in live.fails("robot", "call", "*", "/start", code=code)
 
 
-def test_what_is_no_json_is_told_before_anything_is_ordered(live: Any, relay: Any) -> None:
-    """With what is wrong in it."""
-    assert "ARGS is no JSON" in live.fails("robot", "call", "*", "/start", "{data: true}")
-    assert "MSG is no JSON" in live.fails("robot", "publish", "*", "/mode", "dock")
+def test_invalid_json_is_refused_before_the_order(live: Any, relay: Any) -> None:
+    """The error says what is wrong in it."""
+    assert "ARGS is not JSON" in live.fails("robot", "call", "*", "/start", "{data: true}")
+    assert "MSG is not JSON" in live.fails("robot", "publish", "*", "/mode", "dock")
     assert not relay.asked
 
 
 def test_without_a_relay_nothing_is_ordered(cli: Any) -> None:
-    """Exit code 3."""
+    """The exit code is 3."""
     assert "no relay runs" in cli.fails("robot", "call", "*", "/start", code=3)
 
 
-def test_what_robots_say_is_inert(live: Any, relay: Any) -> None:
-    """Escapes are shown, not obeyed."""
+def test_output_of_robots_is_escaped(live: Any, relay: Any) -> None:
     evil = "\x1b[2J[red]\u202e"
     relay.lines = lines({"robot": evil, **OK, "message": evil}, unmatched=(evil,))
     shown = live("robot", "call", "*", "/start").stdout
@@ -148,13 +145,13 @@ def test_what_robots_say_is_inert(live: Any, relay: Any) -> None:
 
 
 def test_robots_are_put_into_groups(cli: Any) -> None:
-    """The group is made when there is none; every change is in the audit log."""
+    """The group is made if it is missing; every change is audited."""
     for name in ("cleaner-1", "cleaner-2"):
         cli.ok("robot", "add", name)
     assert cli.ok("robot", "group", "add", "Cleaners", "cleaner-2") == "Group cleaners: cleaner-2.\n"
-    told = cli.json("robot", "group", "add", "cleaners", "cleaner-1")
-    assert told == {"group": "cleaners", "robots": ["cleaner-1", "cleaner-2"]}
-    assert cli.json("robot", "group", "list") == [told]
+    reported = cli.json("robot", "group", "add", "cleaners", "cleaner-1")
+    assert reported == {"group": "cleaners", "robots": ["cleaner-1", "cleaner-2"]}
+    assert cli.json("robot", "group", "list") == [reported]
     assert "cleaner-1, cleaner-2" in cli.ok("robot", "group", "list")
     assert cli.ok("robot", "group", "remove", "cleaners", "cleaner-1") == "Group cleaners: cleaner-2.\n"
     assert "is not in group" in cli.fails("robot", "group", "remove", "cleaners", "cleaner-1")

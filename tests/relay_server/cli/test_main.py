@@ -1,4 +1,4 @@
-"""What all commands have in common: where the data is, the audit log, the knock, exit codes, help."""
+"""Common to all commands: the data folder, the audit log, notifying the relay, exit codes, help."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sqlalchemy import create_engine, text
 
 from relay_db.schema import HEAD
 from relay_server.cli import main
-from relay_server.cli.control_socket import SOCKET_NAME
+from relay_server.common.data_dir import SOCKET_NAME
 
 CHANGES = [
     ("realm.add", ("realm", "add", "lab1")),
@@ -36,6 +36,7 @@ CHANGES = [
     ("robot.remove", ("robot", "remove", "rover", "--yes")),
     ("right.grant", ("right", "grant", "ann", "rover", "owner", "--allow", "call:/x")),
     ("right.revoke", ("right", "revoke", "cat", "rover")),
+    ("foxglove_url.create", ("foxglove-url", "create", "rover", "cat")),
     ("token.create", ("token", "create", "ann")),
     ("token.revoke", ("token", "revoke", "1")),
 ]
@@ -46,6 +47,7 @@ LOOKS = [
     ("robot", "list"),
     ("robot", "keys", "rover"),
     ("right", "list"),
+    ("foxglove-url", "list"),
     ("token", "list"),
     ("audit", "list"),
     ("audit", "verify"),
@@ -67,10 +69,9 @@ def _fill(cli: Any) -> None:
 
 
 @pytest.mark.parametrize(("action", "arguments"), CHANGES, ids=[action for action, _ in CHANGES])
-def test_each_change_is_audited_and_knocks(
+def test_change_is_audited_and_announced(
     live: Any, relay: Any, action: str, arguments: tuple[str, ...]
 ) -> None:
-    """One entry that says who by the system's own account, and the relay is told to look."""
     _fill(live)
     before = len(live.json("audit", "list"))
     relay.asked.clear()
@@ -84,8 +85,8 @@ def test_each_change_is_audited_and_knocks(
 
 
 @pytest.mark.parametrize("arguments", LOOKS, ids=" ".join)
-def test_a_look_changes_nothing(live: Any, relay: Any, arguments: tuple[str, ...]) -> None:
-    """No audit entry and no knock; --json prints one line of JSON and nothing else."""
+def test_a_read_changes_nothing(live: Any, relay: Any, arguments: tuple[str, ...]) -> None:
+    """It makes no audit entry and notifies no relay; --json prints one line of JSON and nothing else."""
     _fill(live)
     before = live.json("audit", "list")
     relay.asked.clear()
@@ -97,8 +98,7 @@ def test_a_look_changes_nothing(live: Any, relay: Any, arguments: tuple[str, ...
     assert live.json("audit", "list") == before
 
 
-def test_a_refused_change_is_not_audited_and_does_not_knock(live: Any, relay: Any) -> None:
-    """Nothing changed, nothing to tell."""
+def test_a_refused_change_is_not_audited_and_does_not_notify_the_relay(live: Any, relay: Any) -> None:
     _fill(live)
     before = live.json("audit", "list")
     relay.asked.clear()
@@ -108,8 +108,8 @@ def test_a_refused_change_is_not_audited_and_does_not_knock(live: Any, relay: An
     assert live.json("audit", "list") == before
 
 
-def test_a_broken_chain_is_told(cli: Any) -> None:
-    """With the number of the entry, as exit code 1, also in JSON."""
+def test_a_broken_chain_is_reported(cli: Any) -> None:
+    """It names the entry and exits with code 1, also in JSON."""
     for name in ("ann", "bob"):
         cli.ok("user", "add", name, "--no-password")
     engine = create_engine(f"sqlite:///{cli.data}/switchboard.db")
@@ -123,7 +123,6 @@ def test_a_broken_chain_is_told(cli: Any) -> None:
 
 
 def test_the_audit_log_is_listed_oldest_first_and_cut_to_the_latest(cli: Any) -> None:
-    """As people read a log."""
     for name in ("ann", "bob", "cat"):
         cli.ok("user", "add", name, "--no-password")
     assert [entry["target"] for entry in cli.json("audit", "list", "--limit", "2")] == ["bob", "cat"]
@@ -131,38 +130,37 @@ def test_the_audit_log_is_listed_oldest_first_and_cut_to_the_latest(cli: Any) ->
 
 
 def test_the_data_folder_is_made_for_its_owner_only(cli: Any) -> None:
-    """Also by a command that only looks."""
     cli.ok("user", "list")
     assert stat.S_IMODE(cli.data.stat().st_mode) == 0o700
     assert stat.S_IMODE((cli.data / "switchboard.db").stat().st_mode) == 0o600
 
 
-def test_the_option_beats_the_variable(cli: Any, tmp_path: Path) -> None:
-    """--data before the command, else SWITCHBOARD_DATA."""
-    cli.ok("--data", str(tmp_path / "other"), "user", "add", "ann", "--no-password")
+def test_the_option_beats_the_variable(new_cli: Any, tmp_path: Path) -> None:
+    """--data before the command precedes SWITCHBOARD_DATA."""
+    new_cli.ok("--data", str(tmp_path / "other"), "user", "add", "ann", "--no-password")
     assert (tmp_path / "other" / "switchboard.db").exists()
-    assert not cli.data.exists()
+    assert not new_cli.data.exists()
 
 
 def test_odd_folders_work(cli: Any, tmp_path: Path) -> None:
-    """Blanks, percent signs and hashes in the path."""
+    """Paths may contain blanks, percent signs and hashes."""
     folder = tmp_path / "a b%41#c"
     cli.ok("--data", str(folder), "user", "list")
     assert (folder / "switchboard.db").exists()
 
 
-def test_another_database_is_taken_by_url(cli: Any, tmp_path: Path) -> None:
-    """--db or SWITCHBOARD_DB; the data folder is not needed then."""
+def test_another_database_is_taken_by_url(new_cli: Any, tmp_path: Path) -> None:
+    """With --db or SWITCHBOARD_DB the data folder is not needed."""
     url = f"sqlite:///{tmp_path}/elsewhere/x.db"
-    cli.ok("--db", url, "user", "add", "ann", "--no-password")
-    result = cli("user", "list", "--json", SWITCHBOARD_DB=url)
+    new_cli.ok("--db", url, "user", "add", "ann", "--no-password")
+    result = new_cli("user", "list", "--json", SWITCHBOARD_DB=url)
     assert [each["user"] for each in json.loads(result.stdout)] == ["ann"]
-    assert not cli.data.exists()
-    assert cli.json("--db", url, "db", "upgrade") == {"database": url, "schema": HEAD}
+    assert not new_cli.data.exists()
+    assert new_cli.json("--db", url, "db", "upgrade") == {"database": url, "schema": HEAD}
 
 
 def test_a_database_that_is_not_there_is_exit_code_3(cli: Any, tmp_path: Path) -> None:
-    """A sentence, without a traceback and without the password of the URL."""
+    """The error has no traceback and no password of the URL."""
     result = cli("user", "list", SWITCHBOARD_DB="postgresql://me:hunter22@127.0.0.1:1/x")
     assert (result.exit_code, result.stdout) == (3, "")
     assert result.stderr == "Error: the database server can't be reached\n"
@@ -171,26 +169,25 @@ def test_a_database_that_is_not_there_is_exit_code_3(cli: Any, tmp_path: Path) -
 
 
 def test_a_database_url_that_cannot_be_is_refused(cli: Any) -> None:
-    """As exit code 1."""
-    assert "no database URL" in cli.fails("--db", "nonsense", "user", "list")
+    assert "not a database URL" in cli.fails("--db", "nonsense", "user", "list")
 
 
 def test_a_relay_that_hangs_does_not_hold_a_change_up(
     cli: Any, short_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The knock is given up; the change is made."""
+    """Notifying the relay times out; the change is made."""
     import socket
 
-    from relay_server.cli import control_socket
+    from relay_server.cli import admin_socket_client
 
-    monkeypatch.setattr(control_socket, "_KNOCK_SECONDS", 0.05)
-    monkeypatch.setattr(control_socket, "_ASK_SECONDS", 0.05)
+    monkeypatch.setattr(admin_socket_client, "_NOTIFY_SECONDS", 0.05)
+    monkeypatch.setattr(admin_socket_client, "_STATUS_SECONDS", 0.05)
     with socket.socket(socket.AF_UNIX) as silent:
         silent.bind(str(short_folder / SOCKET_NAME))
         silent.listen()
         cli.ok("--data", str(short_folder), "user", "add", "ann", "--no-password")
-        told = cli.fails("--data", str(short_folder), "status", code=3)
-    assert "does not answer" in told
+        reported = cli.fails("--data", str(short_folder), "status", code=3)
+    assert "does not answer" in reported
     assert len(cli.json("--data", str(short_folder), "user", "list")) == 1
 
 
@@ -209,13 +206,13 @@ def _commands(
 ADMIN = [
     (path, command)
     for path, command in _commands(main, ())
-    if not isinstance(command, click.Group) and path not in {("serve",), ("demo",)}
+    if not isinstance(command, click.Group) and path not in {("serve",), ("demo",), ("worker",)}
 ]
 
 
 @pytest.mark.parametrize(("path", "command"), ADMIN, ids=[" ".join(path) for path, _ in ADMIN])
-def test_each_command_has_help_examples_and_json(path: tuple[str, ...], command: click.Command) -> None:
-    """The help says what it does, shows an example of itself, and what exit codes mean."""
+def test_commands_have_help_examples_and_json(path: tuple[str, ...], command: click.Command) -> None:
+    """The help describes the command, its exit codes, and shows an example."""
     assert command.help
     assert command.epilog is not None
     assert re.search(rf"switchboard( --data \S+)? {' '.join(path)}\b", command.epilog)
@@ -233,7 +230,6 @@ def test_the_help_names_all_commands(cli: Any) -> None:
 
 
 @pytest.mark.parametrize("arguments", [("fly",), ("user", "fly"), ("user", "add"), ("user", "list", "--fly")])
-def test_wrong_usage_is_exit_code_2(cli: Any, arguments: tuple[str, ...]) -> None:
-    """And makes no database."""
-    cli.fails(*arguments, code=2)
-    assert not cli.data.exists()
+def test_wrong_usage_is_exit_code_2(new_cli: Any, arguments: tuple[str, ...]) -> None:
+    new_cli.fails(*arguments, code=2)
+    assert not new_cli.data.exists()

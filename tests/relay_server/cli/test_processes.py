@@ -1,4 +1,4 @@
-"""The command as a process of its own: what it imports, what it leaves on the disk, what others can see."""
+"""The command as a process: its imports, the files it leaves, and what other users can see."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _run(
 
 
 def test_the_contract_of_the_command_line(tmp_path: Path) -> None:
-    """The road from nothing to a token, as scripts go it."""
+    """The steps from an empty folder to a token, as scripts take them."""
     data = tmp_path / "data"
     added = _run(data, "--data", str(data), "user", "add", "ann", "--password-stdin", stdin=PASSWORD)
     assert (added.returncode, added.stderr) == (0, "")
@@ -47,12 +47,12 @@ def test_the_contract_of_the_command_line(tmp_path: Path) -> None:
 
 
 def test_no_secret_is_in_the_data_folder(tmp_path: Path) -> None:
-    """Passwords, tokens and codes are nowhere in any byte of any file there, the write-ahead log included."""
+    """Passwords, tokens and codes are in no file, the write-ahead log included."""
     data = tmp_path / "data"
     _run(data, "user", "add", "ann", "--password-stdin", stdin=PASSWORD)
     code = json.loads(_run(data, "robot", "add", "rover", "--json").stdout)["enrolment_code"]
     token = json.loads(_run(data, "token", "create", "ann", "--json").stdout)["token"]
-    # a reader keeps the write-ahead log from being cleared by the last writer
+    # A reader keeps the last writer from clearing the write-ahead log.
     import sqlite3
 
     reader = sqlite3.connect(data / "switchboard.db")
@@ -70,7 +70,7 @@ def test_no_secret_is_in_the_data_folder(tmp_path: Path) -> None:
 
 
 def test_admin_commands_import_neither_twisted_nor_alembic(tmp_path: Path) -> None:
-    """On a database that is current; that is what makes them start fast."""
+    """This makes them start fast on a current database."""
     data = tmp_path / "data"
     assert _run(data, "db", "upgrade").returncode == 0
     program = (
@@ -85,21 +85,21 @@ def test_admin_commands_import_neither_twisted_nor_alembic(tmp_path: Path) -> No
 
 
 def test_a_failure_is_a_sentence(tmp_path: Path) -> None:
-    """On stderr, one line, no traceback; stdout stays empty."""
+    """One line on stderr without a traceback; stdout stays empty."""
     result = _run(tmp_path / "data", "user", "remove", "eve", "--yes")
     assert (result.returncode, result.stdout) == (1, "")
     assert result.stderr == "Error: there is no user 'eve'; see 'switchboard user list'\n"
 
 
 def test_arguments_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    """Bytes that are no UTF-8, as a shell may pass them."""
+    """Bytes that are not UTF-8, as a shell may pass them."""
     result = _run(tmp_path / "data", "user", "add", os.fsdecode(b"a\xff\x1b"), "--no-password")
     assert (result.returncode, result.stdout) == (1, "")
     assert result.stderr.startswith("Error: the name of a user must")
 
 
 def test_commands_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
-    """Several start on nothing; all succeed, each change is there once, the audit chain is whole."""
+    """Several start on an empty folder; all succeed, each change is made once, and the audit chain is valid."""
     data = tmp_path / "data"
     env = {
         **os.environ,

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.errors import Invalid
-from relay_server.cli.names import of_one_realm
+from relay_server.cli.app import resolve_realm
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def labs(cli: Any) -> Any:
 
 
 def write(cli: Any, what: Callable[[Session], object]) -> None:
-    """As a relay does."""
+    """Writes to the database as a relay does."""
     database = Database(f"sqlite:///{cli.data / 'switchboard.db'}")
     with database.begin() as s:
         what(s)
@@ -39,7 +39,7 @@ def write(cli: Any, what: Callable[[Session], object]) -> None:
 
 
 def targets(cli: Any, action: str) -> list[str]:
-    """On whom or what the audit log says that this was done."""
+    """Targets of this action in the audit log."""
     return [each["target"] for each in cli.json("audit", "list") if each["action"] == action]
 
 
@@ -47,7 +47,7 @@ def targets(cli: Any, action: str) -> list[str]:
 
 
 def test_realms_are_listed_with_how_many_are_in_them(labs: Any) -> None:
-    """The one that every relay has is among them."""
+    """The default realm is included."""
     labs.ok("user", "add", "bob@lab1", "--no-password")
     assert labs.json("realm", "list") == [
         {"realm": "default", "users": 1, "robots": 1, "events_days": None},
@@ -57,7 +57,7 @@ def test_realms_are_listed_with_how_many_are_in_them(labs: Any) -> None:
 
 
 def test_a_realm_has_a_time_of_its_own_for_events(labs: Any) -> None:
-    """In days, until it is the relay's again; what is no time is refused in words."""
+    """In days, until it is reset to the relay's; invalid values are refused."""
     assert labs.json("realm", "set", "LAB1", "--events-days", "7.5") == {"realm": "lab1", "events_days": 7.5}
     assert [each["events_days"] for each in labs.json("realm", "list")] == [None, 7.5]
     assert "for 7.5 days" in labs.ok("realm", "list")
@@ -70,27 +70,25 @@ def test_a_realm_has_a_time_of_its_own_for_events(labs: Any) -> None:
 
 
 def test_a_realm_is_added_once(cli: Any) -> None:
-    """In whatever case it is written, and not by a name that could not be told from others."""
     assert cli.json("realm", "add", "Lab1") == {"realm": "lab1"}
     assert "there is a realm 'lab1' already" in cli.fails("realm", "add", "LAB1")
-    assert "must not have an '@'" in cli.fails("realm", "add", "a@b")
+    assert "must not contain '@'" in cli.fails("realm", "add", "a@b")
     assert targets(cli, "realm.add") == ["lab1"]
 
 
-def test_a_realm_with_anybody_in_it_stays(labs: Any) -> None:
-    """What is left in it is told, thing by thing."""
+def test_a_realm_with_users_or_robots_stays(labs: Any) -> None:
     said = labs.fails("realm", "remove", "lab1", "--yes")
     assert "users and groups and robots and groups of robots in the realm 'lab1'" in said
     labs.ok("user", "remove", "ann@lab1", "--yes")
     labs.ok("group", "remove", "crew@lab1", "--yes")
     labs.ok("robot", "group", "remove", "cleaners@lab1", "--yes")
     assert "there are robots in the realm 'lab1'" in labs.fails("realm", "remove", "lab1", "--yes")
-    assert "stays" in labs.fails("realm", "remove", "default", "--yes")
+    assert "cannot be removed" in labs.fails("realm", "remove", "default", "--yes")
     assert targets(labs, "realm.remove") == []
 
 
 def test_a_realm_is_removed_after_asking(cli: Any) -> None:
-    """The question says what goes with it."""
+    """The question lists what is removed with it."""
     cli.ok("realm", "add", "lab1")
     asked = cli("realm", "remove", "lab1", stdin="n\n")
     assert asked.exit_code == 1
@@ -122,7 +120,7 @@ def test_a_realm_is_removed_after_asking(cli: Any) -> None:
     ids=" ".join,
 )
 def test_a_realm_that_is_not_there_is_named(cli: Any, arguments: tuple[str, ...]) -> None:
-    """With the commands that list realms and add one."""
+    """The error names the commands that list and add realms."""
     said = cli.fails(*arguments)
     assert "there is no realm 'lab9'; see 'switchboard realm list'" in said
     assert "'switchboard realm add'" in said
@@ -130,7 +128,7 @@ def test_a_realm_that_is_not_there_is_named(cli: Any, arguments: tuple[str, ...]
 
 
 def test_lists_show_full_names_the_default_realm_first(labs: Any) -> None:
-    """Or only what is in one realm, in whatever case its name is written."""
+    """Or those of one realm, in any case of its name."""
     labs.ok("user", "add", "zoe", "--no-password")
     assert [each["user"] for each in labs.json("user", "list")] == ["ann", "zoe", "ann@lab1"]
     assert [each["user"] for each in labs.json("user", "list", "--realm", "LAB1")] == ["ann@lab1"]
@@ -147,8 +145,7 @@ def test_lists_show_full_names_the_default_realm_first(labs: Any) -> None:
         assert "@lab1" in labs.ok(*command, "list").splitlines()[-1]
 
 
-def test_who_is_named_with_a_realm_is_meant_and_nobody_else(labs: Any) -> None:
-    """His namesake in the default realm stays as he is; answers and the audit log tell the full name."""
+def test_a_name_with_a_realm_means_that_user_only(labs: Any) -> None:
     assert labs.json("user", "disable", "ann@lab1")["user"] == "ann@lab1"
     labs.user("bob@lab1")
     labs.ok("user", "passwd", "bob@lab1", "--password-stdin", stdin="battery staple\n")
@@ -173,14 +170,12 @@ def test_who_is_named_with_a_realm_is_meant_and_nobody_else(labs: Any) -> None:
 
 
 def test_the_default_realm_may_be_named(labs: Any) -> None:
-    """What is told is the name as everybody knows it, without a realm."""
     assert labs.json("user", "disable", "ann@default")["user"] == "ann"
-    assert "there is a user 'ann' already" in labs.fails("user", "add", "Ann@default")
-    assert "there is a user 'ann@lab1' already" in labs.fails("user", "add", "ann@LAB1")
+    assert "the user 'ann' exists already" in labs.fails("user", "add", "Ann@default")
+    assert "the user 'ann@lab1' exists already" in labs.fails("user", "add", "ann@LAB1")
 
 
-def test_what_is_of_two_realms_does_not_go_together(labs: Any) -> None:
-    """Neither a right, nor who is in a group."""
+def test_names_of_two_realms_cannot_be_combined(labs: Any) -> None:
     for arguments in (
         ("right", "grant", "ann@lab1", "rover", "viewer"),
         ("right", "grant", "@crew", "rover@lab1", "viewer"),
@@ -188,38 +183,36 @@ def test_what_is_of_two_realms_does_not_go_together(labs: Any) -> None:
         ("robot", "group", "add", "cleaners@lab1", "rover"),
     ):
         said = labs.fails(*arguments)
-        assert "of different realms" in said or "not of the realm of the" in said
+        assert "belong to different realms" in said or "not belong to the realm of the" in said
     assert "there is no robot 'mule@lab1'" in labs.fails("right", "grant", "ann", "mule@lab1", "viewer")
 
 
-def test_rights_are_told_with_full_names(labs: Any) -> None:
-    """Of users and of groups."""
+def test_rights_are_printed_with_full_names(labs: Any) -> None:
     granted = labs.json("right", "grant", "@crew@lab1", "rover@lab1", "viewer")
     assert (granted["holder"], granted["robot"]) == ("@crew@lab1", "rover@lab1")
     labs.ok("right", "grant", "ann@lab1", "rover@lab1", "owner")
     labs.ok("right", "grant", "ann", "rover", "owner")
-    told = [(each["holder"], each["robot"]) for each in labs.json("right", "list")]
-    assert sorted(told) == [("@crew@lab1", "rover@lab1"), ("ann", "rover"), ("ann@lab1", "rover@lab1")]
+    reported = [(each["holder"], each["robot"]) for each in labs.json("right", "list")]
+    assert sorted(reported) == [("@crew@lab1", "rover@lab1"), ("ann", "rover"), ("ann@lab1", "rover@lab1")]
     assert len(labs.json("right", "list", "--user", "ann@lab1")) == 2
     assert len(labs.json("right", "list", "--robot", "rover")) == 1
     assert labs.json("right", "revoke", "@crew@lab1", "rover@lab1")["holder"] == "@crew@lab1"
     assert targets(labs, "right.revoke") == ["@crew@lab1 on rover@lab1"]
 
 
-def test_tokens_and_programs_are_told_with_full_names(labs: Any) -> None:
-    """Those of one user are his alone."""
+def test_tokens_and_oauth_clients_are_printed_with_full_names(labs: Any) -> None:
     for name in ("ann", "ann@lab1"):
         assert labs.json("token", "create", name)["user"] == name
-        assert labs.json("program", "add", name)["user"] == name
-    for what in ("token", "program"):
+        assert labs.json("oauth-client", "add", name)["user"] == name
+    for what in ("token", "oauth-client"):
         assert [each["user"] for each in labs.json(what, "list")] == ["ann", "ann@lab1"]
         assert [each["user"] for each in labs.json(what, "list", "--user", "ann@lab1")] == ["ann@lab1"]
         assert "ann@lab1" in labs.ok(what, "list")
-    assert targets(labs, "token.create") == targets(labs, "program.add") == ["ann", "ann@lab1"]
+    assert targets(labs, "token.create") == targets(labs, "oauth_client.add") == ["ann", "ann@lab1"]
 
 
 def test_a_robot_of_a_realm_enrols_by_its_full_name(labs: Any) -> None:
-    """The command that is printed for it says so."""
+    """The printed command contains it."""
     for said in (labs.ok("robot", "code", "rover@lab1"), labs.ok("robot", "add", "mule@lab1")):
         command = shlex.split(said.splitlines()[-1])
         assert command[command.index("--robot") + 1] in ("rover@lab1", "mule@lab1")
@@ -227,8 +220,7 @@ def test_a_robot_of_a_realm_enrols_by_its_full_name(labs: Any) -> None:
     assert targets(labs, "robot.code") == ["rover@lab1"]
 
 
-def test_alerts_are_told_with_full_names(labs: Any) -> None:
-    """Those of a robot, those of all, and who is told of them."""
+def test_alerts_are_printed_with_full_names(labs: Any) -> None:
     write(
         labs,
         lambda s: queries.save_alerts(
@@ -267,10 +259,9 @@ def test_alerts_are_told_with_full_names(labs: Any) -> None:
 
 
 def test_events_are_those_of_one_realm(labs: Any) -> None:
-    """Of the default one unless another is named, by the option or with a robot or a user."""
     write(
         labs,
-        lambda s: queries.remember(
+        lambda s: queries.store_events(
             s,
             [
                 queries.NewStoredEvent("default", 10.0, "relay:rover", "here", 1, "ann", "{}"),
@@ -280,20 +271,19 @@ def test_events_are_those_of_one_realm(labs: Any) -> None:
         ),
     )
     assert [each["kind"] for each in labs.json("events")] == ["here"]
-    told = labs.json("events", "--realm", "LAB1")
-    assert [(each["kind"], each["robot"], each["user"]) for each in told] == [
+    reported = labs.json("events", "--realm", "LAB1")
+    assert [(each["kind"], each["robot"], each["user"]) for each in reported] == [
         ("there", "rover@lab1", "ann@lab1"),
         ("local", "rover@lab1", "admin (local)"),
     ]
-    assert labs.json("events", "--robot", "rover@lab1") == told
-    assert labs.json("events", "--robot", "ro*", "--realm", "lab1") == told
+    assert labs.json("events", "--robot", "rover@lab1") == reported
+    assert labs.json("events", "--robot", "ro*", "--realm", "lab1") == reported
     assert [each["kind"] for each in labs.json("events", "--user", "ann@lab1")] == ["there"]
     assert "one realm at a time" in labs.fails("events", "--robot", "rover@lab1", "--user", "ann")
     assert "give its realm by --realm" in labs.fails("events", "--robot", "ro*@lab1")
 
 
 def test_the_directory_is_that_of_one_realm(labs: Any) -> None:
-    """Of the default one unless another is named, by the option or with a robot."""
 
     def enter(s: Session) -> None:
         for realm, name, id in (("default", "ann", "a1"), ("lab1", "ann", "a2")):
@@ -306,8 +296,8 @@ def test_the_directory_is_that_of_one_realm(labs: Any) -> None:
 
     write(labs, enter)
     assert [each["id"] for each in labs.json("directory")] == ["a1"]
-    (told,) = labs.json("directory", "--realm", "lab1")
-    assert (told["id"], told["robot"], told["user"]) == ("a2", "rover@lab1", "ann@lab1")
+    (reported,) = labs.json("directory", "--realm", "lab1")
+    assert (reported["id"], reported["robot"], reported["user"]) == ("a2", "rover@lab1", "ann@lab1")
     for arguments in (("--robot", "rover@lab1"), ("--robot", "rover", "--realm", "lab1")):
         assert [each["id"] for each in labs.json("directory", *arguments)] == ["a2"]
     assert "there is no robot 'mule@lab1'" in labs.fails("directory", "--robot", "mule@lab1")
@@ -331,11 +321,10 @@ def test_the_directory_is_that_of_one_realm(labs: Any) -> None:
         ([], "lab2", ("lab2", [])),
     ],
 )
-def test_what_is_asked_for_at_once_is_of_one_realm(
+def test_all_names_of_a_request_belong_to_one_realm(
     asked: list[str], realm: str | None, meant: tuple[str, list[str]]
 ) -> None:
-    """That of the names, or of the option, in which case names need none."""
-    assert of_one_realm(asked, realm) == meant
+    assert resolve_realm(asked, realm) == meant
 
 
 @pytest.mark.parametrize(
@@ -348,14 +337,14 @@ def test_what_is_asked_for_at_once_is_of_one_realm(
         (["cleaner-*@lab2"], None, "write 'cleaner-*' and give its realm by --realm"),
         (["group:crew@lab2"], "lab2", "write 'group:crew' and give its realm by --realm"),
         (["mobile@"], None, "the name of a realm must have"),
-        (["mobile@a@b"], None, "the name of a realm must not have an '@'"),
+        (["mobile@a@b"], None, "the name of a realm must not contain '@'"),
         (["mobile"], "lab 2", "the name of a realm must be printable, without spaces"),
     ],
 )
-def test_what_is_of_several_realms_is_refused(asked: list[str], realm: str | None, words: str) -> None:
-    """In a sentence that says what to write instead."""
+def test_names_of_several_realms_are_refused(asked: list[str], realm: str | None, words: str) -> None:
+    """The error says what to write instead."""
     with pytest.raises(Invalid, match=words.replace("*", r"\*")):
-        of_one_realm(asked, realm)
+        resolve_realm(asked, realm)
 
 
 @pytest.mark.parametrize(
@@ -369,20 +358,20 @@ def test_what_is_of_several_realms_is_refused(asked: list[str], realm: str | Non
     ],
 )
 def test_an_order_to_many_goes_to_one_realm(live: Any, relay: Any, arguments: tuple[str, ...]) -> None:
-    """The relay gets the names that robots have there; people get the full ones."""
+    """The relay gets names within the realm; the output has full names."""
     result = {"robot": "mobile", "ok": True, "message": "", "values": None, "seconds": 0.25}
     head = {"do": arguments[0], "robots": ["mobile"], "unmatched": ["arm"]}
     relay.lines = 200, b"\n".join(json.dumps(each).encode() for each in (head, result))
     said = live("robot", *arguments).stdout
     assert said.splitlines()[2].split()[0] == "mobile@lab2"
-    assert "No robot of the realm 'lab2' is meant by 'arm'." in said
+    assert "'arm' matches no robot of the realm 'lab2'." in said
     assert relay.asked == ["POST /fleet?realm=lab2"]
     assert [each["robots"] for each in relay.ordered] == [["mobile"]]
     assert json.loads(live("robot", *arguments, "--json").stdout)["results"][0]["robot"] == "mobile@lab2"
 
 
-def test_an_order_that_means_nobody_names_the_realm(live: Any, relay: Any) -> None:
-    """There may be none of that name; names of two realms never reach the relay."""
+def test_an_order_without_a_match_names_the_realm(live: Any, relay: Any) -> None:
+    """Names of two realms never reach the relay."""
     assert "one realm at a time" in live.fails("robot", "stop", "rover,mobile@lab2")
     assert relay.asked == []
     relay.lines = 404, b'{"detail": "the order means no robot"}'
@@ -394,26 +383,25 @@ def test_an_order_that_means_nobody_names_the_realm(live: Any, relay: Any) -> No
 
 
 def test_a_robot_of_a_realm_is_stopped_without_a_relay(labs: Any) -> None:
-    """The order is kept for it, and not for its namesake; so it is taken back."""
+    """The order is stored for it, not for a robot of the same name. Resuming removes it."""
     assert labs.json("stop", "rover@lab1") == {"robots": [{"robot": "rover@lab1", "done": False}]}
-    assert "no stop of this robot waits" in labs.fails("resume", "rover", code=3)
+    assert "no stop of this robot is waiting" in labs.fails("resume", "rover", code=3)
     assert labs.ok("resume", "rover@lab1") == "Robot rover@lab1 may move again.\n"
     assert targets(labs, "robot.stopped") == targets(labs, "robot.resumed") == ["rover@lab1"]
     assert [each["robot"] for each in labs.json("stop", "--all")["robots"]] == ["rover", "rover@lab1"]
 
 
-def test_a_stop_of_all_is_kept_for_those_the_relay_has_not_told(live: Any, relay: Any) -> None:
-    """A robot is not taken for told because its namesake in another realm was."""
+def test_a_stop_of_all_is_stored_for_robots_the_relay_missed(live: Any, relay: Any) -> None:
     live.ok("realm", "add", "lab1")
     live.ok("robot", "add", "rover")
     live.ok("robot", "add", "rover@lab1")
     relay.motion = (200, b'{"robots": [{"robot": "rover@lab1", "done": true}], "missed": "no answer"}')
-    told = json.loads(live("stop", "--all", "--json").stdout)["robots"]
-    assert told == [{"robot": "rover@lab1", "done": True}, {"robot": "rover", "done": False}]
+    reported = json.loads(live("stop", "--all", "--json").stdout)["robots"]
+    assert reported == [{"robot": "rover@lab1", "done": True}, {"robot": "rover", "done": False}]
 
 
-def test_a_relay_is_told_of_a_robot_by_its_one_name(live: Any, relay: Any) -> None:
-    """However its realm is written: a stop must not fail for a great letter."""
+def test_the_relay_gets_the_full_name_of_a_robot(live: Any, relay: Any) -> None:
+    """Any spelling of the realm works: a stop must not fail for an upper-case letter."""
     relay.motion = (200, b'{"robots": [{"robot": "rover@lab1", "done": true}]}')
     for written in ("rover@LAB1", "rover@lab1"):
         assert live.ok("stop", written) == "Robot rover@lab1 is stopped.\n"
@@ -423,9 +411,8 @@ def test_a_relay_is_told_of_a_robot_by_its_one_name(live: Any, relay: Any) -> No
 
 
 def test_status_of_a_robot_goes_by_its_full_name(live: Any, relay: Any) -> None:
-    """As the relay tells it."""
     robots = [{"name": "rover"}, {"name": "rover@lab1"}]
     relay.answer = (200, json.dumps({"relay": "here", "robots": robots}).encode())
     for asked, name in (("rover@lab1", "rover@lab1"), ("rover", "rover"), ("rover@default", "rover")):
         assert live.json("status", asked)["robots"] == [{"name": name}]
-    assert "has not seen a robot 'rover@lab2'" in live.fails("status", "rover@lab2")
+    assert "does not know a robot 'rover@lab2'" in live.fails("status", "rover@lab2")

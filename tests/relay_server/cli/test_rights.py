@@ -23,7 +23,7 @@ def people(cli: Any) -> Any:
 
 
 def test_rights_are_granted_and_listed(people: Any) -> None:
-    """To a user and to a group; a second grant replaces the first."""
+    """A second grant replaces the first."""
     people.ok("right", "grant", "ann", "rover", "owner")
     answer = people.json(
         "right",
@@ -58,7 +58,6 @@ def test_rights_are_granted_and_listed(people: Any) -> None:
 
 
 def test_rights_are_revoked(people: Any) -> None:
-    """From whom they were given to, and only once."""
     people.ok("right", "grant", "ann", "rover", "viewer")
     people.ok("right", "grant", "@lab", "rover", "viewer")
     assert people.json("right", "revoke", "ann", "rover") == {
@@ -77,30 +76,27 @@ def test_rights_are_revoked(people: Any) -> None:
         (("eve", "rover", "viewer"), "no user 'eve'"),
         (("@ops", "rover", "viewer"), "no group 'ops'"),
         (("ann", "arm", "viewer"), "no robot 'arm'"),
-        (("ann", "rover", "viewer", "--allow", "fly:/x"), "'fly:/x' is no pattern"),
+        (("ann", "rover", "viewer", "--allow", "fly:/x"), "'fly:/x' is not a pattern"),
         (("ann", "rover", "viewer", "--deny", "call:x"), "must begin with /"),
     ],
 )
 def test_a_right_that_cannot_be_is_refused(people: Any, arguments: tuple[str, ...], words: str) -> None:
-    """In a sentence, and nothing is kept."""
     assert words in people.fails("right", "grant", *arguments)
     assert people.json("right", "list") == []
 
 
 def test_an_unknown_level_is_wrong_usage(people: Any) -> None:
-    """The levels there are, are named."""
+    """The error lists the levels."""
     assert "viewer" in people.fails("right", "grant", "ann", "rover", "god", code=2)
 
 
-def test_lists_of_strangers_are_refused(people: Any) -> None:
-    """A filter that names nobody says so instead of showing nothing."""
+def test_lists_of_unauthenticated_clients_are_refused(people: Any) -> None:
     assert "no robot" in people.fails("right", "list", "--robot", "arm")
     assert "no user" in people.fails("right", "list", "--user", "eve")
     assert "no user" in people.fails("token", "list", "--user", "eve")
 
 
 def test_a_token_acts_as_its_user_until_it_expires(people: Any) -> None:
-    """What is printed once is what the database knows by its hash."""
     before = time.time()
     answer = people.json("token", "create", "ann", "--ttl", "1h", "--label", "nightly")
     assert answer["expires_in"] == 3600
@@ -116,8 +112,8 @@ def test_a_token_acts_as_its_user_until_it_expires(people: Any) -> None:
     database.close()
 
 
-def test_for_people_stdout_holds_the_token_alone(people: Any) -> None:
-    """So that a shell can put it into a variable."""
+def test_without_json_stdout_has_only_the_token(people: Any) -> None:
+    """So that a shell can assign it to a variable."""
     result = people("token", "create", "ann")
     assert result.exit_code == 0
     assert result.stdout.startswith("swb_")
@@ -125,8 +121,8 @@ def test_for_people_stdout_holds_the_token_alone(people: Any) -> None:
     assert "not shown again" in result.stderr
 
 
-def test_tokens_are_listed_without_what_could_be_used(people: Any) -> None:
-    """Number, user, kind, times and label."""
+def test_tokens_are_listed_without_secrets(people: Any) -> None:
+    """They have number, user, kind, times and label."""
     answer = people.json("token", "create", "ann", "--ttl", "90s", "--label", "[red]nightly")
     [listed] = people.json("token", "list")
     assert listed["expires"] - listed["created"] == pytest.approx(90)
@@ -143,7 +139,6 @@ def test_tokens_are_listed_without_what_could_be_used(people: Any) -> None:
 
 
 def test_a_token_is_revoked(people: Any) -> None:
-    """By its number, once."""
     number = str(people.json("token", "create", "ann")["id"])
     assert people.json("token", "revoke", number) == {"id": int(number), "revoked": True}
     assert people.json("token", "list") == []
@@ -154,11 +149,11 @@ def test_a_token_is_revoked(people: Any) -> None:
 
 @pytest.mark.parametrize("ttl", ["", "1", "1y", "-1h", "0s", "1h ", "99999w", "1e3s", "١h"])
 def test_a_span_that_cannot_be_is_refused(people: Any, ttl: str) -> None:
-    """The sentence shows how to write one."""
+    """The error shows a valid one."""
     assert "write 90s, 15m, 1h" in people.fails("token", "create", "ann", "--ttl", ttl)
 
 
 def test_a_disabled_user_gets_no_token(people: Any) -> None:
-    """It would be worth nothing."""
+    """It would not work."""
     people.ok("user", "disable", "ann")
     assert "disabled" in people.fails("token", "create", "ann")

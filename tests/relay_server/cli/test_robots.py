@@ -18,7 +18,7 @@ from relay_server.recordings.library import FOLDER, RecordingEntry, RecordingSta
 
 
 def _enrol(cli: Any, robot: str, code: str, agent: str = "robot 1") -> str:
-    """Hand in a new key as the relay does; its fingerprint."""
+    """Enrols a new key as the relay does; returns its fingerprint."""
     key = identity.public_half(identity.generate_key())
     name = identity.fingerprint(key)
     database = Database(f"sqlite:///{cli.data}/switchboard.db")
@@ -31,7 +31,7 @@ def _enrol(cli: Any, robot: str, code: str, agent: str = "robot 1") -> str:
 
 
 def test_a_robot_is_added_with_a_code_that_enrols_it(cli: Any) -> None:
-    """The code is good once, typed in any way."""
+    """The code works once, in any spelling."""
     answer = cli.json("robot", "add", "rover", "--description", "Lab 3")
     assert {**answer, "enrolment_code": ""} == {"robot": "rover", "enrolment_code": "", "expires_in": 900}
     _enrol(cli, "rover", answer["enrolment_code"].lower().replace("-", " "))
@@ -39,7 +39,7 @@ def test_a_robot_is_added_with_a_code_that_enrols_it(cli: Any) -> None:
         _enrol(cli, "rover", answer["enrolment_code"])
 
 
-def test_people_get_the_exact_command(cli: Any) -> None:
+def test_the_exact_command_is_printed(cli: Any) -> None:
     """One line to copy, with this machine's name and the usual port."""
     lines = cli.ok("robot", "add", "rover").splitlines()
     command = shlex.split(lines[-1])
@@ -56,15 +56,16 @@ def test_people_get_the_exact_command(cli: Any) -> None:
 
 
 def test_the_command_names_the_port_of_the_running_relay(live: Any, relay: Any) -> None:
-    """A relay that runs here is asked where robots dial, and whether by TLS."""
+    """A running relay reports the robots' host and port, and whether it uses TLS."""
     relay.answer = (200, b'{"robots_port": 12345}')
     assert f" --relay {socket.gethostname()}:12345 " in live.ok("robot", "add", "rover")
-    relay.answer = (200, b'{"robots_port": 12345, "robots_loopback": true, "tls": true}')
+    relay.answer = (200, b'{"robots_port": 12345, "robots_host": "127.0.0.1", "robots_tls": true}')
     assert " --relay 127.0.0.1:12345 --tls " in live.ok("robot", "add", "rover2")
+    relay.answer = (200, b'{"robots_port": 12345, "robots_host": "2001:db8::7", "robots_tls": true}')
+    assert " --relay '[2001:db8::7]:12345' --tls " in live.ok("robot", "add", "rover3")
 
 
 def test_a_new_code_voids_the_one_before(cli: Any) -> None:
-    """Of two codes only the later enrols."""
     first = cli.json("robot", "add", "rover")["enrolment_code"]
     second = cli.json("robot", "code", "rover")["enrolment_code"]
     with pytest.raises(Refused):
@@ -74,13 +75,13 @@ def test_a_new_code_voids_the_one_before(cli: Any) -> None:
 
 @pytest.mark.parametrize("name", ["Rover", "a b", "a\x1b[2J", "-", "a/b", "x" * 64])
 def test_a_robot_name_that_cannot_be_is_refused(cli: Any, name: str) -> None:
-    """In a sentence that says what can be."""
-    told = cli.fails("robot", "add", "--", name)
-    assert told.startswith("Error: a robot's name has lower-case letters")
+    """The error describes valid names."""
+    reported = cli.fails("robot", "add", "--", name)
+    assert reported.startswith("Error: a robot's name has lower-case letters")
 
 
 def test_robots_are_listed_with_their_live_keys(cli: Any) -> None:
-    """Hostile descriptions are refused, markup in them is text."""
+    """Invalid descriptions are refused, and markup in them is printed as text."""
     cli.ok("robot", "add", "rover", "--description", "[red]x[/red] :boom:")
     code = cli.json("robot", "add", "arm")["enrolment_code"]
     _enrol(cli, "arm", code)
@@ -95,7 +96,7 @@ def test_robots_are_listed_with_their_live_keys(cli: Any) -> None:
 
 
 def test_keys_are_listed_and_revoked(cli: Any) -> None:
-    """A revoked key stays in the list as retired; what the robot said of itself can't act on the terminal."""
+    """A revoked key stays in the list as retired; the robot's own description cannot control the terminal."""
     code = cli.json("robot", "add", "rover")["enrolment_code"]
     name = _enrol(cli, "rover", code, agent="\x1b]0;pwned\x07 [bold]1")
     table = cli.ok("robot", "keys", "rover")
@@ -111,7 +112,7 @@ def test_keys_are_listed_and_revoked(cli: Any) -> None:
 
 
 def test_a_robot_is_removed(cli: Any) -> None:
-    """After asking."""
+    """The command asks for confirmation."""
     cli.ok("robot", "add", "rover")
     assert cli("robot", "remove", "rover", stdin="n\n").exit_code == 1
     assert cli.json("robot", "remove", "rover", "--yes") == {"robot": "rover", "removed": True}
@@ -120,8 +121,8 @@ def test_a_robot_is_removed(cli: Any) -> None:
         assert "no robot 'rover'" in cli.fails("robot", command, "rover")
 
 
-def test_what_is_recorded_of_a_robot_is_told_before_it_is_removed(cli: Any) -> None:
-    """How many and how large; the relay deletes them."""
+def test_recordings_are_named_before_a_robot_is_removed(cli: Any) -> None:
+    """The question says how many and how large they are; the relay deletes them."""
     cli.ok("robot", "add", "rover")
     folder = cli.data / FOLDER
     folder.mkdir()
@@ -133,7 +134,9 @@ def test_what_is_recorded_of_a_robot_is_told_before_it_is_removed(cli: Any) -> N
         (folder / f"{id}.mcap").write_bytes(bytes(size))
     asked = cli("robot", "remove", "rover", stdin="n\n")
     assert "its keys and all rights on it, and its 2 recordings (1.3 MB)?" in asked.stderr
-    told = cli.ok("robot", "remove", "rover", "--yes")
-    assert "The relay deletes its 2 recordings (1.3 MB): now if it runs, else when it starts." in told
+    reported = cli.ok("robot", "remove", "rover", "--yes")
+    assert (
+        "The relay deletes its 2 recordings (1.3 MB): now if it runs, otherwise when it starts." in reported
+    )
     *_, entry = cli.json("audit", "list")
     assert entry["data"] == {"recordings": 2}

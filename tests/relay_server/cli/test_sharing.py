@@ -21,7 +21,7 @@ def labs(cli: Any) -> Any:
 
 
 def test_a_robot_is_shared_and_taken_out_again(labs: Any) -> None:
-    """Rights on it are given by either of its names; all that is done is on record."""
+    """Rights may name it either way; each step is audited."""
     assert labs.json("robot", "share", "mobile@lab1", "Lab2") == {
         "robot": "mobile@lab1",
         "realm": "lab2",
@@ -34,7 +34,9 @@ def test_a_robot_is_shared_and_taken_out_again(labs: Any) -> None:
     (listed,) = labs.json("robot", "list", "--realm", "lab2")
     assert (listed["robot"], listed["shared"]) == ("mobile@lab1", ["lab2"])
     assert [each["robots"] for each in labs.json("realm", "list")] == [0, 1, 1]
-    assert "not of the realm lab2 any more" in labs.ok("robot", "unshare", "mobile@lab1", "lab2", "--yes")
+    assert "no longer belongs to the realm lab2" in labs.ok(
+        "robot", "unshare", "mobile@lab1", "lab2", "--yes"
+    )
     assert labs.json("right", "list") == []
     done = [
         (each["action"], each["target"], each["data"].get("realm")) for each in labs.json("audit", "list")
@@ -44,23 +46,24 @@ def test_a_robot_is_shared_and_taken_out_again(labs: Any) -> None:
 
 
 def test_a_shared_robot_is_removed_by_its_own_name(labs: Any) -> None:
-    """Who means to take it out of a realm does not remove it by mistake."""
     labs.ok("robot", "share", "mobile@lab1", "lab2")
     assert "robot unshare" in labs.fails("robot", "remove", "mobile@lab2", "--yes")
     labs.ok("robot", "remove", "mobile@LAB1", "--yes")
     assert labs.json("robot", "list") == []
 
 
-def test_sharing_says_what_is_wrong(labs: Any) -> None:
-    """A realm that there is not, a name that is taken, a robot that is not shared."""
+def test_sharing_has_clear_errors(labs: Any) -> None:
+    """These are an unknown realm, a name in use, and a robot that is not shared."""
     assert "realm list" in labs.fails("robot", "share", "mobile@lab1", "lab3")
-    assert "not of the realm" in labs.fails("robot", "unshare", "mobile@lab1", "lab2", "--yes")
+    assert "not belong to the realm" in labs.fails("robot", "unshare", "mobile@lab1", "lab2", "--yes")
     labs.ok("robot", "add", "mobile@lab2")
     assert "another robot" in labs.fails("robot", "share", "mobile@lab1", "lab2")
 
 
 def test_a_user_joins_another_realm_with_one_password(labs: Any) -> None:
-    """It is that of the first account, and changed there; the account is removed like any."""
+    """It is the password of the first account and changed there; the joined account is removed like any
+    other.
+    """
     joined = labs.json("user", "join", "toad@lab1", "lab2")
     assert (joined["user"], joined["guest_of"], joined["password"]) == ("toad@lab2", "toad@lab1", True)
     assert "that of toad@lab1" in labs.ok("user", "list", "--realm", "lab2")
@@ -71,8 +74,8 @@ def test_a_user_joins_another_realm_with_one_password(labs: Any) -> None:
     assert [each["user"] for each in labs.json("user", "list")] == ["toad@lab1", "ann@lab2"]
 
 
-def test_a_robot_is_described_anew(labs: Any) -> None:
-    """In one line, which its list has; on record."""
+def test_a_robot_gets_a_new_description(labs: Any) -> None:
+    """It is one line, shown in the list, and audited."""
     assert "on the bench" in labs.ok("robot", "describe", "mobile@lab1", "on the bench")
     (listed,) = labs.json("robot", "list")
     assert listed["description"] == "on the bench"

@@ -10,12 +10,12 @@ import pytest
 from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.clocks import now_ns
-from relay_server.cli import control_socket, stop
+from relay_server.cli import admin_socket_client, stop
 from relay_server.cli.app import os_user
 
 
 def pending(cli: Any) -> list[tuple[int, str, str]]:
-    """What robots are still to be told."""
+    """Robots with a stored stop."""
     database = Database(f"sqlite:///{cli.data}/switchboard.db")
     try:
         with database.reading() as s:
@@ -24,14 +24,11 @@ def pending(cli: Any) -> list[tuple[int, str, str]]:
         database.close()
 
 
-def test_without_a_relay_the_order_is_kept(cli: Any) -> None:
-    """For the next that runs; it is in the audit log."""
+def test_without_a_relay_the_order_is_stored(cli: Any) -> None:
     cli.ok("robot", "add", "rover")
     cli.ok("robot", "add", "mule")
     said = cli.ok("stop", "rover", "--why", "smoke")
-    assert (
-        said == "Robot rover can't be reached now; it will be stopped before anything else when it is back.\n"
-    )
+    assert said == "Robot rover cannot be reached now; it will be stopped as soon as it comes back.\n"
     assert pending(cli) == [(1, os_user(), "smoke")]
     assert cli.json("stop", "--all") == {
         "robots": [{"robot": "mule", "done": False}, {"robot": "rover", "done": False}]
@@ -40,19 +37,18 @@ def test_without_a_relay_the_order_is_kept(cli: Any) -> None:
     assert [each["action"] for each in cli.json("audit", "list")][-3:] == ["robot.stopped"] * 3
 
 
-def test_an_order_that_was_not_told_is_taken_back(cli: Any) -> None:
-    """Once; then only the robot itself knows, which must be online for that."""
+def test_an_order_that_was_not_sent_is_cancelled(cli: Any) -> None:
+    """After that only the robot knows of the stop, and must be online to resume."""
     cli.ok("robot", "add", "rover")
     cli.ok("stop", "rover")
     assert cli.ok("resume", "rover", "--why", "all clear") == "Robot rover may move again.\n"
     assert pending(cli) == []
-    assert "no stop of this robot waits to be told" in cli.fails("resume", "rover", code=3)
+    assert "no stop of this robot is waiting to be sent" in cli.fails("resume", "rover", code=3)
 
 
-def test_one_robot_or_all(cli: Any) -> None:
-    """Neither and both are wrong usage; what does not exist is told."""
+def test_robot_argument_or_all(cli: Any) -> None:
     cli.ok("robot", "add", "rover")
-    assert "name a robot, or say --all" in cli("stop").stderr
+    assert "name a robot, or give --all" in cli("stop").stderr
     assert cli("stop").exit_code == 2
     assert cli("stop", "rover", "--all").exit_code == 2
     assert "there is no robot 'mule'" in cli.fails("stop", "mule")
@@ -61,7 +57,7 @@ def test_one_robot_or_all(cli: Any) -> None:
 
 
 def test_a_relay_that_runs_is_asked(live: Any, relay: Any) -> None:
-    """It says what became of each; what failed makes the command fail."""
+    """It reports the result for each robot; a failure makes the command fail."""
     relay.motion = (
         200,
         json.dumps(
@@ -69,26 +65,34 @@ def test_a_relay_that_runs_is_asked(live: Any, relay: Any) -> None:
                 "robots": [
                     {"robot": "a", "done": True},
                     {"robot": "b", "done": False},
-                    {"robot": "c", "done": False, "reason": "the contactor does not answer\x1b[2J"},
+                    {"robot": "c", "done": False, "reason": "the database is locked\x1b[2J"},
+                    {
+                        "robot": "d",
+                        "done": False,
+                        "reason": "robot d is stopped, but …",
+                        "stopped": {"by": "root"},
+                    },
                 ]
             }
         ).encode(),
     )
     result = live("stop", "--all", "--why", "smoke")
     assert result.exit_code == 1
-    first, second, third = result.stdout.splitlines()
+    first, second, third, fourth = result.stdout.splitlines()
     assert first == "Robot a is stopped."
-    assert "b can't be reached now" in second
-    assert "the contactor does not answer" in third
+    assert "b cannot be reached now" in second
+    assert third.startswith("Robot c: the database is locked")
+    assert fourth == "Robot d is stopped, but …"
     assert "\x1b" not in third
-    assert relay.ordered == [{"robot": None, "why": "smoke", "by": os_user()}]
+    (order,) = relay.ordered
+    assert len(order.pop("stop_id")) == 32
+    assert order == {"robot": None, "why": "smoke", "by": os_user()}
     relay.motion = (200, b"{}")
     assert live.ok("resume", "a") == "Robot a may move again.\n"
     assert relay.asked == ["POST /stop", "POST /resume"]
 
 
-def test_an_order_says_when_it_was_given(live: Any, relay: Any) -> None:
-    """By the machine's clock, which the relay reads too: one that was frozen does not do later what was meant now."""
+def test_an_order_has_its_time(live: Any, relay: Any) -> None:
     before = now_ns()
     live.ok("resume", "rover")
     live("robot", "call", "rover", "/reset")
@@ -97,17 +101,16 @@ def test_an_order_says_when_it_was_given(live: Any, relay: Any) -> None:
     assert before < first < second < now_ns()
 
 
-def test_what_a_relay_refuses_is_told(live: Any, relay: Any) -> None:
-    """With the exit code that fits."""
+def test_a_refusal_by_the_relay_is_printed(live: Any, relay: Any) -> None:
+    """The exit code fits the refusal."""
     for status, code in ((404, 1), (409, 1), (412, 1), (503, 3)):
         relay.motion = (status, json.dumps({"detail": "in its own words"}).encode())
         assert live.fails("resume", "rover", code=code) == "Error: in its own words\n"
     relay.motion = (200, b"<html>")
-    assert "answered something else" in live.fails("stop", "rover", code=3)
+    assert "sent an unexpected answer" in live.fails("stop", "rover", code=3)
 
 
 def test_help_shows_examples(cli: Any) -> None:
-    """And what the exit codes mean."""
     for command in ("stop", "resume"):
         said = cli.ok(command, "--help")
         assert "Examples:" in said
@@ -115,32 +118,52 @@ def test_help_shows_examples(cli: Any) -> None:
 
 
 def test_a_reason_that_is_no_text_does_not_hold_up_a_stop(live: Any, relay: Any) -> None:
-    """Bytes that are no UTF-8 come to the relay as question marks, or it could not read the order."""
+    """Bytes that are not UTF-8 become question marks, so that the relay can read the order."""
     relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}]}')
     assert live.ok("stop", "rover", "--why", b"sm\xffke".decode("utf-8", "surrogateescape"))
     assert [order["why"] for order in relay.ordered] == ["sm?ke"]
 
 
-def test_a_stop_that_a_relay_does_not_confirm_is_kept(
+def test_a_stop_that_a_relay_does_not_confirm_is_stored(
     live: Any, relay: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And that is told, on each robot: nobody knows whether it stands."""
-    monkeypatch.setattr(control_socket, "_SURE_SECONDS", 0.05)
-    monkeypatch.setattr(control_socket, "_MOTION_SECONDS", 0.3)
+    monkeypatch.setattr(admin_socket_client, "_UNSURE_SECONDS", 0.05)
+    monkeypatch.setattr(admin_socket_client, "_ORDER_SECONDS", 0.3)
     live.ok("robot", "add", "rover")
     relay.may_answer.clear()
     result = live("stop", "--all", "--why", "smoke")
     assert result.exit_code == 3
-    assert "has not answered for 0.05 s. The order is kept" in result.stderr
+    assert "has not answered for 0.05 s. The order is stored" in result.stderr
     assert "Robot rover: not confirmed: the relay on this data folder does not answer" in result.stdout
     assert pending(live) == [(1, os_user(), "smoke")]
 
 
-def test_an_answer_that_comes_late_is_told_all_the_same(
+def test_a_stop_that_the_relay_has_stored_is_not_stored_and_audited_again(
     live: Any, relay: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The order was kept meanwhile; the relay knows what to do with it."""
-    monkeypatch.setattr(control_socket, "_SURE_SECONDS", 0.05)
+    """The relay has audited it already. Both cut a long reason alike."""
+    live.ok("robot", "add", "rover")
+    send_order = stop.send_order
+
+    def store_first(folder: Any, what: str, order: dict[str, Any], *rest: Any) -> dict[str, Any]:
+        database = Database(f"sqlite:///{live.data}/switchboard.db")
+        with database.begin() as s:
+            queries.order_stop(s, 1, order["by"], order["why"], 5.0, order["stop_id"])
+        database.close()
+        return send_order(folder, what, order, *rest)
+
+    relay.motion = (0, b"")
+    assert live("stop", "rover", "--why", "x" * 600).exit_code == 3
+    assert pending(live) == [(1, os_user(), "x" * 500)]
+    monkeypatch.setattr(stop, "send_order", store_first)
+    assert live("stop", "rover", "--why", "x" * 600).exit_code == 3
+    assert pending(live) == [(1, os_user(), "x" * 500)]
+    stopped = [each for each in live.json("audit", "list") if each["action"] == "robot.stopped"]
+    assert [each["data"]["why"] for each in stopped] == ["x" * 500]
+
+
+def test_a_late_answer_is_printed(live: Any, relay: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(admin_socket_client, "_UNSURE_SECONDS", 0.05)
     live.ok("robot", "add", "rover")
     relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}]}')
     relay.may_answer.clear()
@@ -150,29 +173,28 @@ def test_an_answer_that_comes_late_is_told_all_the_same(
         said.append(sentence)
         relay.may_answer.set()
 
-    monkeypatch.setattr(stop, "say_aside", tell)
+    monkeypatch.setattr(stop, "print_note", tell)
     assert live.ok("stop", "rover") == "Robot rover is stopped.\n"
-    assert "The order is kept" in said[0]
+    assert "The order is stored" in said[0]
     assert [robot for robot, *_ in pending(live)] == [1]
 
 
-def test_a_stop_is_kept_when_the_relay_hangs_up_or_can_not_say(live: Any, relay: Any) -> None:
-    """It may have died of the order, or have lost its database."""
+def test_a_stop_is_stored_when_the_relay_disconnects_or_fails(live: Any, relay: Any) -> None:
+    """The order may have made it crash, or its database may be away."""
     live.ok("robot", "add", "rover")
     for number, motion in enumerate([(0, b""), (503, b'{"detail": "in its own words"}'), (200, b"<html>")]):
         relay.motion = motion
         result = live("stop", "rover", "--why", f"the {number}")
-        assert (result.exit_code, "The order is kept" in result.stdout) == (3, True), result.output
+        assert (result.exit_code, "The order is stored" in result.stdout) == (3, True), result.output
         assert pending(live) == [(1, os_user(), f"the {number}")]
 
 
-def test_robots_that_the_relay_could_not_look_up_are_kept_to_be_stopped(live: Any, relay: Any) -> None:
-    """Those it has told are not told again."""
+def test_stops_of_robots_the_relay_could_not_look_up_are_stored(live: Any, relay: Any) -> None:
     live.ok("robot", "add", "rover")
     live.ok("robot", "add", "mule")
     relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}], "missed": "it did not answer"}')
     result = live("stop", "--all")
     assert result.exit_code == 0, result.output
-    assert "Not all robots are told yet: it did not answer" in result.stderr
-    assert result.stdout.startswith("Robot rover is stopped.\nRobot mule can't be reached now")
+    assert "Not all robots have the order yet: it did not answer" in result.stderr
+    assert result.stdout.startswith("Robot rover is stopped.\nRobot mule cannot be reached now")
     assert [robot for robot, *_ in pending(live)] == [2]

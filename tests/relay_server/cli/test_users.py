@@ -23,14 +23,14 @@ def _stored_hash(cli: Any, name: str) -> str | None:
 
 
 def test_a_user_is_added_with_a_password_from_stdin(cli: Any) -> None:
-    """The first line counts, without its end, and what is stored verifies it."""
+    """The first line without its line end is stored as a hash."""
     answer = cli.json("user", "add", "Ann", "--admin", "--password-stdin", stdin=f"{PASSWORD}\r\nsecond line")
     assert answer == {"user": "ann", "admin": True, "disabled": False, "password": True, "guest_of": None}
     assert verify_password(PASSWORD, _stored_hash(cli, "ann"))
 
 
 def test_a_password_is_asked_for_twice_and_not_shown(cli: Any) -> None:
-    """Two that differ are asked again; nothing typed appears, and stdout holds only the JSON."""
+    """Different inputs are asked for again; no input is shown, and stdout has only JSON."""
     typed = f"{PASSWORD}\nsomething else\n{PASSWORD}\n{PASSWORD}\n"
     result = cli("user", "add", "ann", "--json", stdin=typed)
     assert result.exit_code == 0
@@ -44,7 +44,6 @@ def test_a_password_is_asked_for_twice_and_not_shown(cli: Any) -> None:
 
 
 def test_a_user_without_a_password_has_none(cli: Any) -> None:
-    """Only tokens let it in."""
     assert cli.json("user", "add", "report", "--no-password")["password"] is False
     assert _stored_hash(cli, "report") is None
     assert "exclude" in cli.fails("user", "add", "x", "--no-password", "--password-stdin", code=2)
@@ -59,22 +58,21 @@ def test_a_user_without_a_password_has_none(cli: Any) -> None:
         ("\n", "no password"),
     ],
 )
-def test_a_password_against_the_rules_adds_nobody(cli: Any, stdin: str, words: str) -> None:
-    """A sentence that does not repeat the password."""
-    told = cli.fails("user", "add", "ann", "--password-stdin", stdin=stdin)
-    assert words in told
-    assert "short" not in told
+def test_an_invalid_password_adds_no_user(cli: Any, stdin: str, words: str) -> None:
+    """The error does not repeat the password."""
+    reported = cli.fails("user", "add", "ann", "--password-stdin", stdin=stdin)
+    assert words in reported
+    assert "short" not in reported
     assert cli.json("user", "list") == []
 
 
 def test_a_password_that_is_no_text_is_refused(cli: Any) -> None:
-    """Bytes that are no UTF-8."""
+    """It has bytes that are not UTF-8."""
     assert "UTF-8" in cli.fails("user", "add", "ann", "--password-stdin", stdin=b"\xff\xfe\xfd\xfc12345\n")
 
 
 @pytest.mark.parametrize("option", ["--password", "-p", "--password=secret"])
 def test_a_password_is_never_an_argument(cli: Any, option: str) -> None:
-    """There is no option that takes one."""
     result = cli("user", "add", "ann", option, "secretive")
     assert result.exit_code == 2
     assert cli.json("user", "list") == []
@@ -82,21 +80,20 @@ def test_a_password_is_never_an_argument(cli: Any, option: str) -> None:
 
 @pytest.mark.parametrize("name", ["a b", "a\x1b[2Jb", "a\nb", "", "@lab", "x" * 64, "a\u202eb", "\udcff"])
 def test_a_name_that_cannot_be_is_refused_inertly(cli: Any, name: str) -> None:
-    """A sentence, in which nothing of the name acts on the terminal."""
-    told = cli.fails("user", "add", name, "--no-password")
-    assert told.startswith("Error: the name of a user must")
-    assert told.rstrip("\n").isprintable()
+    """The error contains no control characters of the name."""
+    reported = cli.fails("user", "add", name, "--no-password")
+    assert reported.startswith("Error: the name of a user must")
+    assert reported.rstrip("\n").isprintable()
 
 
 def test_a_name_in_another_case_is_the_same_user(cli: Any) -> None:
-    """Adding Ann after ann is refused, before a password is asked for; disabling ANN disables ann."""
+    """Adding Ann after ann is refused before a password is asked for; disabling ANN disables ann."""
     cli.user("ann")
     assert "already" in cli.fails("user", "add", "Ann")
     assert cli.json("user", "disable", "ANN")["user"] == "ann"
 
 
 def test_users_are_listed(cli: Any) -> None:
-    """For people a table, for programs a list."""
     cli.user("bob")
     cli.user("ann", "--admin")
     cli.ok("user", "disable", "bob")
@@ -112,14 +109,13 @@ def test_users_are_listed(cli: Any) -> None:
 
 
 def test_a_user_is_disabled_and_enabled(cli: Any) -> None:
-    """Both answer with the state reached."""
+    """Both print the new state."""
     cli.user("ann")
     assert cli.json("user", "disable", "ann")["disabled"] is True
     assert cli.json("user", "enable", "ann")["disabled"] is False
 
 
 def test_a_password_is_changed(cli: Any) -> None:
-    """The old one is no longer good, and an unknown user is told before anything is typed."""
     cli.user("ann")
     cli.ok("user", "passwd", "ann", "--password-stdin", stdin="battery staple\n")
     hashed = _stored_hash(cli, "ann")
@@ -129,7 +125,7 @@ def test_a_password_is_changed(cli: Any) -> None:
 
 
 def test_removing_asks_first(cli: Any) -> None:
-    """No and end of input leave the user; yes and --yes remove it."""
+    """No and end of input keep the user; yes and --yes remove it."""
     cli.user("ann")
     cli.user("bob")
     for answer in ("n\n", ""):
@@ -143,13 +139,12 @@ def test_removing_asks_first(cli: Any) -> None:
 
 
 @pytest.mark.parametrize("command", ["disable", "enable", "remove", "passwd"])
-def test_an_unknown_user_is_told(cli: Any, command: str) -> None:
-    """With where to look for the known ones."""
+def test_an_unknown_user_is_reported(cli: Any, command: str) -> None:
+    """The error says how to list known users."""
     assert cli.fails("user", command, "eve") == "Error: there is no user 'eve'; see 'switchboard user list'\n"
 
 
 def test_groups_are_joined_and_left(cli: Any) -> None:
-    """Each answers with who is in the group then."""
     cli.user("ann")
     assert cli.json("group", "add", "Lab") == {"group": "lab", "members": []}
     assert cli.json("group", "join", "lab", "ann") == {"group": "lab", "members": ["ann"]}
@@ -163,7 +158,7 @@ def test_groups_are_joined_and_left(cli: Any) -> None:
 
 
 def test_a_group_is_removed(cli: Any) -> None:
-    """After asking."""
+    """The command asks for confirmation."""
     cli.ok("group", "add", "lab")
     assert cli("group", "remove", "lab", stdin="n\n").exit_code == 1
     assert cli.json("group", "remove", "lab", "--yes") == {"group": "lab", "removed": True}

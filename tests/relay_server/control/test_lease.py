@@ -1,4 +1,4 @@
-"""The table of control: from every state only what can follow."""
+"""The control table: each state allows only its own transitions."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import itertools
 import pytest
 
 from relay_server.control.lease import FREE, NEXT, ControlRequest, Lease, LeaseEvent, LeaseState
-from tests.relay_server.steering import Place
+from tests.worlds.control import ControlWorld
 
-PLACE = Place()
+PLACE = ControlWorld()
 ANN, BOB = PLACE.connection("ann"), PLACE.connection("bob")
 
 
@@ -19,22 +19,22 @@ def held() -> Lease:
 
 
 def requested() -> Lease:
-    """Bob asks for it."""
+    """Bob requests control."""
     return held().requested(ControlRequest(BOB, 3.0, 33.0, "my turn"))
 
 
-def test_nobody_has_control_before_the_robot_has_agreed() -> None:
-    """Who is coming is not yet there."""
+def test_control_starts_when_the_robot_has_agreed() -> None:
+    """A pending controller has no control yet."""
     asked = FREE.give(ANN, 1.0)
     assert (asked.state, asked.holder) == (LeaseState.ASKING, None)
-    assert asked.coming_to(ANN)
+    assert asked.pending_for(ANN)
     assert not asked.held_by(ANN)
     assert held().held_by(ANN)
     assert held().holder == (ANN, 2.0, False)
 
 
-def test_a_hand_over_leaves_nobody_in_between() -> None:
-    """While the robot is told of Bob, neither Ann nor Bob moves it."""
+def test_a_handover_never_leaves_control_free() -> None:
+    """While the robot is notified of Bob, neither Ann nor Bob moves it."""
     handing = requested().give(BOB, 4.0)
     assert handing.holder is None
     assert handing.request is None
@@ -42,27 +42,29 @@ def test_a_hand_over_leaves_nobody_in_between() -> None:
 
 
 def test_a_robot_that_does_not_agree_leaves_it_free() -> None:
-    """Asked for somebody, or for nobody."""
+    """This holds for a new controller and for a release."""
     assert FREE.give(ANN, 1.0).failed() == FREE
     assert held().free().failed() == FREE
     assert held().free().done(3.0) == FREE
 
 
 def test_a_lost_link_frees_it_from_every_state() -> None:
-    """Whoever had it, was to have it or asked for it."""
+    """Controller, pending controller and requester are removed."""
     for lease in (FREE, FREE.give(ANN, 1.0), held(), requested(), held().free()):
         assert lease.lost() == FREE
 
 
 def test_a_request_is_taken_back() -> None:
-    """The holder holds on."""
+    """The controller keeps control."""
     assert requested().state is LeaseState.REQUESTED
     assert requested().requested_by(BOB)
     assert requested().withdrawn() == held()
 
 
 def test_there_are_never_two() -> None:
-    """Whatever happens in whatever order, there is at most one of holder and coming, and a request only to a holder."""
+    """For any order of events there is at most one of controller and pending controller, and a request only
+    to a controller.
+    """
     events = {
         LeaseEvent.GIVE: lambda lease: lease.give(BOB, 1.0),
         LeaseEvent.FREE: lambda lease: lease.free(),
@@ -79,14 +81,14 @@ def test_there_are_never_two() -> None:
             if (lease.state, event) in NEXT:
                 lease = events[event](lease)
                 reached.add(lease.state)
-        assert lease.holder is None or lease.coming is None
+        assert lease.holder is None or lease.pending_holder is None
         assert (lease.holder is not None) == (lease.state in (LeaseState.HELD, LeaseState.REQUESTED))
-        assert (lease.coming is not None) == (lease.state is LeaseState.ASKING)
+        assert (lease.pending_holder is not None) == (lease.state is LeaseState.ASKING)
         assert (lease.request is not None) == (lease.state is LeaseState.REQUESTED)
     assert reached == set(LeaseState)
 
 
-def test_what_can_not_follow_is_an_error_of_ours() -> None:
-    """Nobody asks for what is free."""
+def test_impossible_transition_is_an_internal_error() -> None:
+    """For example a request for a free robot."""
     with pytest.raises(ValueError, match="'request' can't happen while control is free"):
         FREE.requested(ControlRequest(BOB, 1.0, 2.0, ""))

@@ -1,4 +1,4 @@
-"""What may be ordered."""
+"""Valid fleet orders."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage
-from relay_server.fleet.order import PATTERNS, TARGETS, FleetStopOrder, Order
+from relay_server.fleet.order import MAX_PATTERNS, MAX_TARGETS, FleetStopOrder, Order
 
 
 def order(**fields: Any) -> Order:
-    """An order as it comes, checked."""
+    """A checked order."""
     body = json.dumps({"robots": ["*"], **fields}).encode()
     if fields.get("do") == "stop":
         made = jsontext.decode(msgspec.json.Decoder(FleetStopOrder), body).order
@@ -34,11 +34,25 @@ def order(**fields: Any) -> Order:
         ({"do": "publish", "topic": "/mode", "msg": {"data": "dock"}}, "/mode"),
         ({"do": "set", "name": "/driver:speed", "value": 0.5}, "/driver:speed"),
         ({"do": "set", "name": "/driver:on", "value": False, "timeout": 0.1}, "/driver:on"),
+        ({"do": "module", "module": "cleaning", "action": "start"}, "start cleaning"),
     ],
 )
-def test_what_can_be_ordered(fields: dict[str, Any], subject: str) -> None:
-    """With what it is about."""
+def test_known_orders(fields: dict[str, Any], subject: str) -> None:
+    """Each kind with its fields."""
     assert order(**fields).subject == subject
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"), [("press-1", "press-1"), (7, ""), (None, ""), ("x" * 65, ""), (["x"], "")]
+)
+def test_no_stop_is_refused_for_its_id(given: Any, kept: str) -> None:
+    """An invalid id is ignored."""
+    assert order(do="stop", stop_id=given).stop_id == kept
+
+
+def test_only_a_stop_has_an_id() -> None:
+    with pytest.raises(Invalid, match="'stop_id' does not go with 'resume'"):
+        order(do="resume", stop_id="press-1")
 
 
 @pytest.mark.parametrize(
@@ -51,13 +65,12 @@ def test_what_can_be_ordered(fields: dict[str, Any], subject: str) -> None:
         ({"do": "resume", "service": "/start"}, "'service' does not go with 'resume'"),
         ({"do": "call", "service": "/start", "msg": {"a": 1}}, "'msg' does not go with 'call'"),
         ({"do": "publish", "topic": "/a", "value": 0}, "'value' does not go with 'publish'"),
-        ({"do": "resume", "why": "x" * 501}, "'why' must be a string of 500 characters at most"),
+        ({"do": "resume", "why": "x" * 501}, "'why' must be a string of at most 500 characters"),
         ({"do": "call", "service": "/start", "why": None}, "'why' must be a string"),
         ({"do": "publish", "topic": "/a", "why": "x"}, "'why' does not go with 'publish'"),
     ],
 )
-def test_what_makes_no_sense_is_told(fields: dict[str, Any], words: str) -> None:
-    """Rather than passed over."""
+def test_invalid_value_is_reported(fields: dict[str, Any], words: str) -> None:
     with pytest.raises(Invalid, match=words):
         order(**fields)
 
@@ -66,7 +79,7 @@ def test_what_makes_no_sense_is_told(fields: dict[str, Any], words: str) -> None
     ("why", "kept"), [("fire", "fire"), (None, ""), (7, ""), ({"a": [1]}, ""), ("x" * 501, "x" * 500)]
 )
 def test_no_stop_is_refused_for_its_reason(why: Any, kept: str) -> None:
-    """What can't be used of it is left out."""
+    """Invalid reasons are left out."""
     assert order(do="stop", why=why).why == kept
 
 
@@ -82,14 +95,14 @@ def test_no_stop_is_refused_for_its_reason(why: Any, kept: str) -> None:
     ],
 )
 def test_no_stop_is_refused_for_what_does_not_go_with_it(more: dict[str, Any]) -> None:
-    """It is passed over: whoever sends it wants robots to stand."""
+    """Other fields are ignored: the sender wants the robots to stand."""
     made = order(do="stop", why="fire", **more)
     assert (made.robots, made.do, made.why, made.subject) == (["*"], "stop", "fire", "")
 
 
 def test_an_order_may_name_many_robots() -> None:
-    """As many as it may mean; a page that shows them all names each."""
-    names = [f"rover-{number}" for number in range(TARGETS)]
+    """As many as it may select, since a page with all robots names each."""
+    names = [f"rover-{number}" for number in range(MAX_TARGETS)]
     for do in ("stop", "resume"):
         assert order(do=do, robots=names).robots == names
 
@@ -97,10 +110,10 @@ def test_an_order_may_name_many_robots() -> None:
 @pytest.mark.parametrize("one", ["rover-*", "rover-?", "rover-[12]", "group:hall"])
 @pytest.mark.parametrize("do", ["stop", "resume"])
 def test_an_order_has_few_patterns(one: str, do: str) -> None:
-    """Each is held against all robots there are."""
-    order(do=do, robots=[one] * PATTERNS + ["tank"])
-    with pytest.raises(Invalid, match="64 patterns and groups at most"):
-        order(do=do, robots=[one] * (PATTERNS + 1))
+    """Each is matched against all robots."""
+    order(do=do, robots=[one] * MAX_PATTERNS + ["tank"])
+    with pytest.raises(Invalid, match="at most 64 patterns and groups"):
+        order(do=do, robots=[one] * (MAX_PATTERNS + 1))
 
 
 @pytest.mark.parametrize(
@@ -112,15 +125,15 @@ def test_an_order_has_few_patterns(one: str, do: str) -> None:
         {"do": "stop", "robots": [""]},
         {"do": "stop", "robots": "*"},
         {"do": "stop", "robots": None},
-        {"do": "stop", "robots": ["a"] * (TARGETS + 1)},
+        {"do": "stop", "robots": ["a"] * (MAX_TARGETS + 1)},
         {"do": "stop", "robots": ["a" * 256]},
-        {"do": "resume", "robots": ["a"] * (TARGETS + 1)},
+        {"do": "resume", "robots": ["a"] * (MAX_TARGETS + 1)},
         {"do": "resume", "timeout": 0},
         {"do": "resume", "timeout": 301},
         {"do": "resume", "wy": "typo"},
     ],
 )
-def test_what_is_no_order_is_malformed(fields: dict[str, Any]) -> None:
-    """Unknown fields too: they could be a typing error in something that matters."""
+def test_other_messages_are_malformed(fields: dict[str, Any]) -> None:
+    """Unknown fields are malformed too, since they may be typing errors."""
     with pytest.raises(MalformedMessage):
         order(**fields)

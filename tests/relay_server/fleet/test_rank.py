@@ -1,14 +1,14 @@
-"""Many robots, some at a time."""
+"""Work for many robots, a few at a time."""
 
 from __future__ import annotations
 
 from twisted.internet.defer import CancelledError, Deferred
 
-from relay_server.common.gather import bounded_gather
+from relay_server.common.concurrency import bounded_gather
 
 
 class Field:
-    """Robots that are done when the test says so."""
+    """Robots that finish when the test says so."""
 
     def __init__(self) -> None:
         self.open: dict[str, Deferred[None]] = {}
@@ -16,7 +16,7 @@ class Field:
         self.given_up: list[str] = []
 
     async def do(self, name: str) -> None:
-        """Until the test says that it is done."""
+        """Lasts until the test ends it."""
         self.begun.append(name)
         self.open[name] = Deferred()
         try:
@@ -26,12 +26,12 @@ class Field:
             raise
 
     def done(self, name: str) -> None:
-        """It is done there."""
+        """Ends the work for one robot."""
         self.open.pop(name).callback(None)
 
 
 def test_some_have_their_turn_at_a_time() -> None:
-    """The next when one is done; it is over with the last."""
+    """Each end starts the next, and the last end completes the whole."""
     field, over = Field(), []
     running = Deferred.fromCoroutine(bounded_gather("abcde", field.do, at_once=2))
     running.addCallback(over.append)
@@ -45,8 +45,8 @@ def test_some_have_their_turn_at_a_time() -> None:
     assert over == [None]
 
 
-def test_who_gives_up_ends_what_has_begun() -> None:
-    """And nothing else begins."""
+def test_caller_that_gives_up_ends_what_has_begun() -> None:
+    """Waiting robots are not started."""
     field, ends = Field(), []
     running = Deferred.fromCoroutine(bounded_gather("abcde", field.do, at_once=2))
     running.addErrback(lambda failure: ends.append(failure.type))
@@ -56,8 +56,8 @@ def test_who_gives_up_ends_what_has_begun() -> None:
     assert ends == [CancelledError]
 
 
-def test_what_goes_wrong_ends_the_others() -> None:
-    """An error that nobody foresaw is not one of a single robot."""
+def test_failure_ends_the_others() -> None:
+    """An unexpected error does not belong to a single robot."""
     field, ends = Field(), []
     running = Deferred.fromCoroutine(bounded_gather("abc", field.do, at_once=2))
     running.addErrback(lambda failure: ends.append(failure.type))
@@ -67,7 +67,6 @@ def test_what_goes_wrong_ends_the_others() -> None:
 
 
 def test_no_robots_are_done_at_once() -> None:
-    """There is nothing to wait for."""
     over: list[None] = []
     Deferred.fromCoroutine(bounded_gather([], Field().do)).addCallback(over.append)
     assert over == [None]

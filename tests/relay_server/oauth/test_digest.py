@@ -12,14 +12,14 @@ from relay_server.auth import passwords
 from relay_server.oauth import digest as module
 from relay_server.oauth.digest import NONCE_SECONDS, Digest, StaleNonce
 
-KEY, SECRET = "swp_1", "swb_secret"
-KNOWN = passwords.verifier(KEY, SECRET)
+KEY, SECRET = "swc_1", "swb_secret"
+KNOWN = passwords.digest_ha1(KEY, SECRET)
 URL = "http://relay/oauth/token?x=1"
 URI = "/oauth/token?x=1"
 
 
 class Clock:
-    """Seconds that pass when the test says so."""
+    """A clock of the test."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -29,13 +29,13 @@ class Clock:
 
 
 class Client:
-    """A program that answers challenges as httpx does."""
+    """An OAuth client that answers challenges as httpx does."""
 
     def __init__(self, secret: str = SECRET) -> None:
         self._auth = httpx.DigestAuth(KEY, secret)
 
     def answer(self, challenge: str, method: str = "POST") -> str:
-        """What it sends after it got this challenge."""
+        """Its answer to this challenge."""
         flow = self._auth.auth_flow(httpx.Request(method, URL))
         first = next(flow)
         if "authorization" not in first.headers:
@@ -44,23 +44,23 @@ class Client:
         return str(first.headers["authorization"])
 
     def again(self) -> str:
-        """What it sends with its next request, to the challenge that it has."""
+        """Its next request, with the challenge that it has."""
         return self.answer("")
 
 
 @pytest.fixture
 def clock() -> Clock:
-    """Time."""
+    """A clock."""
     return Clock()
 
 
 @pytest.fixture
 def digest(clock: Clock) -> Digest:
-    """Who asks."""
+    """Digest authentication on the clock."""
     return Digest(clock)
 
 
-def test_who_has_the_secret_is_believed(digest: Digest) -> None:
+def test_the_right_secret_is_accepted(digest: Digest) -> None:
     """Once, and again with the next count."""
     client = Client()
     proof = digest.read(client.answer(digest.challenge()))
@@ -69,8 +69,8 @@ def test_who_has_the_secret_is_believed(digest: Digest) -> None:
     digest.check(digest.read(client.again()), KNOWN, "POST", URI)
 
 
-def test_a_challenge_names_what_is_asked_for(digest: Digest) -> None:
-    """SHA-256, counted; no MD5."""
+def test_a_challenge_names_its_parameters(digest: Digest) -> None:
+    """SHA-256 with a count, and no MD5."""
     said = digest.challenge()
     assert 'realm="switchboard"' in said and "algorithm=SHA-256" in said and 'qop="auth"' in said
     assert "stale" not in said
@@ -81,10 +81,8 @@ def test_a_challenge_names_what_is_asked_for(digest: Digest) -> None:
     ("secret", "method", "uri"),
     [("other", "POST", URI), (SECRET, "GET", URI), (SECRET, "POST", "/oauth/revoke")],
 )
-def test_who_has_not_or_asks_for_something_else_is_not(
-    digest: Digest, secret: str, method: str, uri: str
-) -> None:
-    """An answer is for one method and one address."""
+def test_a_wrong_secret_or_request_is_refused(digest: Digest, secret: str, method: str, uri: str) -> None:
+    """An answer is valid for one method and one address."""
     proof = digest.read(Client(secret).answer(digest.challenge()))
     with pytest.raises(BadCredentials, match="secret is wrong") as caught:
         digest.check(proof, KNOWN, method, uri)
@@ -92,15 +90,14 @@ def test_who_has_not_or_asks_for_something_else_is_not(
 
 
 def test_an_answer_counts_once(digest: Digest) -> None:
-    """Who has listened can't send it again."""
     header = Client().answer(digest.challenge())
     digest.check(digest.read(header), KNOWN, "POST", URI)
-    with pytest.raises(StaleNonce, match="given before"):
+    with pytest.raises(StaleNonce, match="used before"):
         digest.check(digest.read(header), KNOWN, "POST", URI)
 
 
 def test_an_old_challenge_is_replaced(digest: Digest, clock: Clock) -> None:
-    """The answer is right, and comes too late."""
+    """The answer is right but too late."""
     client = Client()
     header = client.answer(digest.challenge())
     clock.now += NONCE_SECONDS + 1
@@ -108,15 +105,13 @@ def test_an_old_challenge_is_replaced(digest: Digest, clock: Clock) -> None:
         digest.check(digest.read(header), KNOWN, "POST", URI)
 
 
-def test_a_challenge_of_somebody_else_is_worth_nothing(digest: Digest, clock: Clock) -> None:
-    """One of before a restart, or one that somebody made up."""
+def test_a_foreign_challenge_is_refused(digest: Digest, clock: Clock) -> None:
     header = Client().answer(Digest(clock).challenge())
     with pytest.raises(StaleNonce):
         digest.check(digest.read(header), KNOWN, "POST", URI)
 
 
 def test_memory_is_bounded(digest: Digest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """When too many challenges are in use all are given out anew, so that no answer counts twice."""
     monkeypatch.setattr(module, "NONCES", 2)
     client = Client()
     headers = [Client().answer(digest.challenge()) for _ in range(2)]
@@ -146,8 +141,8 @@ def test_memory_is_bounded(digest: Digest, monkeypatch: pytest.MonkeyPatch) -> N
         lambda header: re.sub(r'nonce="[^"]+"', 'nonce="\ud800"', header),
     ],
 )
-def test_what_is_no_answer_is_refused_in_words(digest: Digest, change: object) -> None:
-    """Whatever the header says, nothing breaks."""
+def test_an_invalid_response_is_refused(digest: Digest, change: object) -> None:
+    """For any content of the header."""
     header = change(Client().answer(digest.challenge()))  # type: ignore[operator]
     with pytest.raises(BadCredentials):
         digest.check(digest.read(header), KNOWN, "POST", URI)

@@ -1,4 +1,4 @@
-"""Cameras as resources: pages of them, one with the addresses of its pictures, and both as graphs."""
+"""Cameras as resources: their pages, each with the addresses of its pictures, and both as graphs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,25 @@ from relay_server.access import Principal
 from relay_server.http.media_types import FORMS, MediaType
 from relay_server.http.rdf.encode import camera_graph, members_graph
 from relay_server.http.rdf.serialize import read, write
-from relay_server.resources.cameras import CameraService
-from relay_server.resources.location import ResourceLocation
-from relay_server.resources.page import PageQuery
-from relay_server.resources.service import RequestOrigin
-from relay_server.video.ports import NO_CAMERA
+from relay_server.in_process_sessions.pool import RobotCaller
+from relay_server.resources.page import TypedPageQuery
+from relay_server.resources.robots_http import CameraService
+from relay_server.resources.states import ResourceLocation
+from relay_server.video.errors import NO_CAMERA
 
-ASKER = RequestOrigin(Principal(1, "ann", "main", False, 1, None), "rover", "192.0.2.1")
+CALLER = RobotCaller(Principal(1, "ann", "main", False, 1, None), "rover", "192.0.2.1")
 PLACE = ResourceLocation("https://robots.example:8443", "rover")
 OWN = Namespace("https://robots.example:8443/api/v1/vocabulary/switchboard#")
-SHOWN = {"viewers": 2, "state": "open", "settings": {"width": 320, "crop": [0, 0, 0, 0]}, "playing": None}
+SHOWN = {
+    "viewers": 2,
+    "state": "open",
+    "settings": {"width": 320, "crop": [0, 0, 0, 0]},
+    "stream_status": None,
+}
 
 
 def camera(name: str, type_name: str = "sensor_msgs/msg/Image", **facts: Any) -> dict[str, Any]:
-    """A camera as it is told."""
+    """A camera in its JSON form."""
     plain = dict.fromkeys(("encoding", "width", "height", "fps", "seen"))
     return {"name": name, "type": type_name, **plain, "streams": [], **facts}
 
@@ -38,7 +43,7 @@ BACK = camera("/back")
 
 
 async def look(principal: Principal, robot: str) -> list[dict[str, Any]]:
-    """What ann may view of rover."""
+    """Cameras of rover that ann may view."""
     if (principal.name, robot) != ("ann", "rover"):
         raise NotFound("there is no such robot, or you have no right on it")
     return [FRONT, GATE, BACK]
@@ -46,11 +51,11 @@ async def look(principal: Principal, robot: str) -> list[dict[str, Any]]:
 
 @pytest_twisted.ensureDeferred
 async def test_a_page_of_cameras() -> None:
-    """In the order of their names, by name and type, some at a time."""
-    desk = CameraService(look)
+    """Ordered by name, filtered by name and type, with a page size."""
+    cameras = CameraService(look)
 
     async def names(**listing: Any) -> tuple[list[str], str]:
-        page = await desk.members(ASKER, PageQuery(**listing))
+        page = await cameras.members(CALLER, TypedPageQuery(**listing))
         return [each["name"] for each in page["cameras"]], page["next"]
 
     assert await names() == (["/back", "/front", "/gate/usb"], "")
@@ -58,15 +63,15 @@ async def test_a_page_of_cameras() -> None:
     assert await names(name="/gate/*") == (["/gate/usb"], "")
     assert await names(type="sensor_msgs/msg/Image") == (["/back", "/front"], "")
     with pytest.raises(NotFound):
-        await desk.members(ASKER._replace(robot="other"), PageQuery())
+        await cameras.members(CALLER._replace(robot="other"), TypedPageQuery())
 
 
 @pytest_twisted.ensureDeferred
-async def test_one_camera_tells_where_its_pictures_are() -> None:
-    """With or without the slash at its beginning; one that may not be viewed is like none."""
-    desk = CameraService(look)
+async def test_camera_links_to_its_frames() -> None:
+    """With or without the leading slash; a camera without the right to view counts as missing."""
+    cameras = CameraService(look)
     place = "/robots/rover/video"
-    assert await desk.camera(ASKER, "gate/usb") == {
+    assert await cameras.camera(CALLER, "gate/usb") == {
         **GATE,
         "addresses": {
             "snapshot": f"{place}/snapshot?topic=%2Fgate%2Fusb",
@@ -75,18 +80,18 @@ async def test_one_camera_tells_where_its_pictures_are() -> None:
             "websocket": f"{place}/ws?topic=%2Fgate%2Fusb",
         },
     }
-    assert (await desk.camera(ASKER, "/front"))["width"] == 640
+    assert (await cameras.camera(CALLER, "/front"))["width"] == 640
     with pytest.raises(NotFound, match=NO_CAMERA):
-        await desk.camera(ASKER, "hidden")
+        await cameras.camera(CALLER, "hidden")
     with pytest.raises(Invalid):
-        await desk.camera(ASKER, "no name")
+        await cameras.camera(CALLER, "no name")
 
 
 @pytest.mark.parametrize("form", FORMS[1:])
 @pytest_twisted.ensureDeferred
 async def test_a_camera_is_a_sensor(form: MediaType) -> None:
-    """With numbers that are numbers; what is not known is not said, and its pictures are resources."""
-    graph = camera_graph(await CameraService(look).camera(ASKER, "front"), PLACE)
+    """Numbers are numbers, unknown values are left out, and its pictures are resources."""
+    graph = camera_graph(await CameraService(look).camera(CALLER, "front"), PLACE)
     node, robot = URIRef(PLACE.of("cameras", "/front")), URIRef(PLACE.address)
     assert str(node) == "https://robots.example:8443/api/v1/robots/rover/cameras/front"
     assert set(graph.objects(node, RDF.type)) == {OWN.Camera, SOSA.Sensor}
@@ -97,7 +102,7 @@ async def test_a_camera_is_a_sensor(form: MediaType) -> None:
         "https://robots.example:8443/robots/rover/video/snapshot?topic=%2Ffront"
     )
     assert isomorphic(read(write(graph, form), form, str(node)), graph)
-    bare = camera_graph(await CameraService(look).camera(ASKER, "back"), PLACE)
+    bare = camera_graph(await CameraService(look).camera(CALLER, "back"), PLACE)
     assert not {OWN.width, OWN.fps, OWN.seen, OWN.encoding} & set(bare.predicates())
 
 
@@ -109,5 +114,5 @@ def test_cameras_are_members_of_their_collection(form: MediaType) -> None:
     members = [URIRef(PLACE.of("cameras", each["name"])) for each in (FRONT, GATE)]
     assert set(graph.objects(collection, RDFS.member)) == set(members)
     assert all((each, RDF.type, OWN.Camera) in graph for each in members)
-    told: Graph = read(write(graph, form), form, str(collection))
-    assert isomorphic(told, graph)
+    reported: Graph = read(write(graph, form), form, str(collection))
+    assert isomorphic(reported, graph)

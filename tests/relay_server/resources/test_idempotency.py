@@ -1,4 +1,4 @@
-"""Requests with a key are done once, and answered as often as they are sent."""
+"""A request with an idempotency key is carried out once; repetitions get the same answer."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import Invalid, Refused, Unavailable
-from relay_server.control.commands import NotDone
+from relay_server.common.errors import NotDone
 from relay_server.http import idempotency as module
 from relay_server.http.idempotency import Idempotency, KeyReused, StoredReply, Target, key_in
-from relay_server.http_sessions.loopback_client import MaybeDone
+from relay_server.in_process_sessions.in_process_port import MaybeDone
 from relay_server.resources.goals import GoalOwner
-from tests.relay_server.steering import outcome, result
+from tests.worlds.control import outcome, result
 
 ANN = GoalOwner(1, "default", None)
 DONE = StoredReply(200, b'"done"')
 
 
 class Requests:
-    """Requests of people, and what is done for them."""
+    """Requests of users, and the work done for them."""
 
     def __init__(self) -> None:
         self.clock = Clock()
@@ -30,7 +30,7 @@ class Requests:
         self.withdrawn = False
 
     def send(self, key: str = "k", body: bytes = b"{}", owner: GoalOwner = ANN, **target: str) -> list[Any]:
-        """One request; the list holds its answer, or its error, as soon as there is one."""
+        """Sends a request; the list gets its answer or error."""
         return outcome(self.request(key, body, owner, **target))
 
     def request(
@@ -41,7 +41,7 @@ class Requests:
         robot: str = "rover",
         address: str = "/a",
     ) -> Deferred[StoredReply]:
-        """The same, to be given up."""
+        """Sends a request that the test may cancel."""
         target = Target(owner, robot, address, key)
         return Deferred.fromCoroutine(self.memory.once(target, body, self._do, self._may))
 
@@ -56,12 +56,12 @@ class Requests:
 
 @pytest.fixture
 def requests() -> Requests:
-    """None yet."""
+    """No requests yet."""
     return Requests()
 
 
 def test_the_first_answer_is_given_again(requests: Requests) -> None:
-    """Also to who asks before it is there."""
+    """This includes repetitions that arrive before the first answer."""
     first, second = requests.send(), requests.send()
     assert (first, second) == ([], [])
     (work,) = requests.work
@@ -81,21 +81,21 @@ def test_the_first_answer_is_given_again(requests: Requests) -> None:
     ],
 )
 def test_a_key_means_nothing_elsewhere(requests: Requests, other: dict[str, Any]) -> None:
-    """To another user or scope, at another robot or address."""
+    """Other users, scopes, robots and addresses have their own keys."""
     requests.send()
     requests.send(**other)
     assert len(requests.work) == 2
 
 
 def test_another_body_is_another_request(requests: Requests) -> None:
-    """Which needs a key of its own, also while the first is under way."""
+    """It needs a key of its own, also while the first request is active."""
     requests.send()
     (error,) = requests.send(body=b"[]")
     assert isinstance(error, KeyReused)
 
 
-def test_what_is_begun_is_done_though_its_sender_leaves(requests: Requests) -> None:
-    """He gets the answer when he comes again."""
+def test_started_order_completes_without_its_sender(requests: Requests) -> None:
+    """The sender gets the answer by repeating the request."""
     left = requests.request()
     left.addErrback(lambda failure: None)
     left.cancel()
@@ -115,7 +115,7 @@ def test_what_is_begun_is_done_though_its_sender_leaves(requests: Requests) -> N
 def test_errors_are_given_again_unless_nothing_was_done(
     requests: Requests, error: Exception, kept: bool
 ) -> None:
-    """Then it is tried anew."""
+    """If nothing was done, the request is tried again."""
     first, second = requests.send(), requests.send()
     requests.work[0].errback(error)
     assert first == second == [error]
@@ -124,8 +124,8 @@ def test_errors_are_given_again_unless_nothing_was_done(
     assert len(requests.work) == (1 if kept else 2)
 
 
-def test_an_answer_is_given_to_who_may_ask_still(requests: Requests) -> None:
-    """The right to may be gone by then."""
+def test_a_stored_answer_needs_the_current_right(requests: Requests) -> None:
+    """The right may be revoked by then."""
     requests.send()
     requests.work[0].callback(DONE)
     requests.withdrawn = True
@@ -133,8 +133,8 @@ def test_an_answer_is_given_to_who_may_ask_still(requests: Requests) -> None:
     assert isinstance(error, Refused)
 
 
-def test_an_answer_is_kept_for_ten_minutes(requests: Requests) -> None:
-    """From the time when it was there; then nothing is left of it."""
+def test_an_answer_is_stored_for_ten_minutes(requests: Requests) -> None:
+    """From the time of the answer; then no state is left."""
     requests.send()
     requests.clock.advance(module.KEPT_SECONDS)
     requests.work[0].callback(DONE)
@@ -145,8 +145,8 @@ def test_an_answer_is_kept_for_ten_minutes(requests: Requests) -> None:
     assert requests.send() == []
 
 
-def test_so_many_answers_are_kept(requests: Requests, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one user, by number and by size: the oldest go, the newest stays, and so does what is under way."""
+def test_stored_answers_are_limited(requests: Requests, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Per user, by number and by size: the oldest answers are removed; the newest and active requests stay."""
     monkeypatch.setattr(module, "KEYS", 3)
     monkeypatch.setattr(module, "ANSWERS_BYTES", 100)
     for key, size in (("a", 10), ("b", 10), ("c", 10), ("d", 10)):
@@ -161,8 +161,8 @@ def test_so_many_answers_are_kept(requests: Requests, monkeypatch: pytest.Monkey
     assert requests.send("a") == [DONE]
 
 
-def test_so_many_are_under_way(requests: Requests, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one user; of others as many."""
+def test_active_requests_are_limited(requests: Requests, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Per user."""
     monkeypatch.setattr(module, "KEYS", 2)
     requests.send("a"), requests.send("b")
     (error,) = requests.send("c")
@@ -183,19 +183,19 @@ def test_so_many_are_under_way(requests: Requests, monkeypatch: pytest.MonkeyPat
     ],
 )
 def test_keys_are_read_with_and_without_quotes(values: list[str], key: str | None) -> None:
-    """As the draft wants them, and as programs send them."""
+    """The draft requires quotes; some programs leave them out."""
     assert key_in(values) == key
 
 
 @pytest.mark.parametrize("values", [[""], ['""'], ['"open'], ["a b"], ["ä"], ["k" * 256], ["a", "b"]])
 def test_a_key_that_makes_no_sense_is_refused(values: list[str]) -> None:
-    """In words."""
+    """With a reason."""
     with pytest.raises(Invalid, match="idempotency-key"):
         key_in(values)
 
 
 def test_an_answer_at_once_is_an_answer(requests: Requests) -> None:
-    """What waits for nothing is done within the request."""
+    """Work without waiting is done within the request."""
 
     async def work() -> StoredReply:
         return DONE

@@ -1,4 +1,4 @@
-"""Robots as resources: pages of them, and when one is another than it was."""
+"""Robots as resources: their pages, and their entity tags."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import pytest_twisted
 
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
+from relay_server.http.router import decode_query
 from relay_server.resources.page import PageQuery
-from relay_server.resources.robots import RobotService, robot_tag, robots_tag
+from relay_server.resources.robots_http import RobotService, robot_tag, robots_tag
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 
 
 def robot(name: str, **more: Any) -> dict[str, Any]:
-    """What is told of a robot."""
+    """A robot in its JSON form."""
     return {"name": name, "state": "online", "rtt_ms": 1.0, "last_seen": 2.0, **more}
 
 
 class Overview:
-    """Knows three robots."""
+    """Has three robots."""
 
     async def robots(self, principal: Principal) -> list[dict[str, Any]]:
         """In no order."""
@@ -29,12 +30,12 @@ class Overview:
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_page_is_in_the_order_of_names_and_says_where_the_next_begins() -> None:
-    """Shell wildcards name what is meant."""
-    desk = RobotService(Overview())
+async def test_a_page_is_ordered_by_name_and_has_a_cursor() -> None:
+    """Each page has a cursor; shell wildcards filter names."""
+    robots = RobotService(Overview())
 
     async def names(**asked: str) -> tuple[list[str], str]:
-        page = await desk.members(ANN, PageQuery.of(asked, typed=False))
+        page = await robots.members(ANN, decode_query(asked, PageQuery))
         return [each["name"] for each in page["robots"]], cast(str, page["next"])
 
     assert await names() == (["arm", "rex", "rover"], "")
@@ -44,17 +45,17 @@ async def test_a_page_is_in_the_order_of_names_and_says_where_the_next_begins() 
 
 
 @pytest_twisted.ensureDeferred
-async def test_one_is_found_by_its_whole_name() -> None:
-    """There are no wildcards in an address."""
-    desk = RobotService(Overview())
-    assert (await desk.robot(ANN, "arm"))["name"] == "arm"
+async def test_entry_is_found_by_its_whole_name() -> None:
+    """An address has no wildcards."""
+    robots = RobotService(Overview())
+    assert (await robots.robot(ANN, "arm"))["name"] == "arm"
     for other in ("a*", "tank"):
         with pytest.raises(NotFound):
-            await desk.robot(ANN, other)
+            await robots.robot(ANN, other)
 
 
 def test_a_ping_makes_no_other_robot_of_it() -> None:
-    """Whatever else is told of it does."""
+    """Any other change changes the tag."""
     known = robot_tag(robot("rover"))
     assert robot_tag(robot("rover", rtt_ms=5.0, last_seen=9.0)) == known
     assert robot_tag(robot("rover", state="offline")) != known

@@ -1,4 +1,4 @@
-"""A stream's life: every event in every state, and what viewers and the robot are told meanwhile."""
+"""The life of a stream: every event in every state, and notifications to viewers and robot."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ from msgspec import structs
 
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, Unavailable
-from relay_server.video.first_frame_timeout import FIRST_PICTURE_SECONDS
+from relay_server.video.errors import NO_CAMERA, EncoderUnavailable, NoFrame
+from relay_server.video.frame_waits import FIRST_FRAME_SECONDS, KEY_SECONDS
 from relay_server.video.frames import STALE_SECONDS
-from relay_server.video.keyframes import KEY_SECONDS
-from relay_server.video.ports import NO_CAMERA, EncoderUnavailable, NoFrame
 from relay_server.video.stream import (
     JOIN_SECONDS,
     LINGER_SECONDS,
     LINKED,
-    MOST_REOPEN_SECONDS,
+    MAX_REOPEN_SECONDS,
     NEXT,
     REOPEN_SECONDS,
+    STATUS_SECONDS,
     STREAM_VIEWERS,
-    TELL_SECONDS,
     CameraStream,
     StreamCallbacks,
     StreamEvent,
     StreamState,
 )
-from tests.relay_server.memory import MemoryLink, World
-from tests.relay_server.video.watching import (
+from tests.worlds.relay import MemoryLink, World
+from tests.worlds.viewers import (
     CAMERA,
     DELTA,
     KEY,
@@ -41,14 +40,14 @@ from tests.relay_server.video.watching import (
 )
 
 H264 = link.VideoSettings(codec="h264")
-PLAYING = link.Playing(width=32, height=24, quality=80)
+PLAYING = link.StreamStatus(width=32, height=24, quality=80)
 
 
 def watched(
     world: World, settings: link.VideoSettings | None = None
 ) -> tuple[CameraStream, Watcher, MemoryLink]:
-    """An open stream with one viewer, and the robot's end."""
-    if world.robot.control is None:
+    """An open stream with one viewer, and the robot's side."""
+    if world.robot.control_link is None:
         robot_comes(world)
     watcher = Watcher()
     stream = watcher.watch(world, settings)
@@ -56,7 +55,7 @@ def watched(
 
 
 def brought_to(world: World, state: StreamState) -> CameraStream:
-    """A stream in this state, by what really happens."""
+    """A stream that real events have brought to this state."""
     if state is StreamState.NEW:
         hooks = StreamCallbacks(lambda stream: "ticket", *3 * (lambda stream: None,))
         return CameraStream(world.clock, world.robot, CAMERA, link.VideoSettings(), "rover#video0", hooks)
@@ -75,25 +74,25 @@ def brought_to(world: World, state: StreamState) -> CameraStream:
 @pytest.mark.parametrize("event", StreamEvent)
 @pytest.mark.parametrize("state", StreamState)
 def test_every_event_in_every_state(world: World, state: StreamState, event: StreamEvent) -> None:
-    """The table says what follows; what it does not list changes nothing."""
+    """The table lists all transitions; other events change nothing."""
     stream = brought_to(world, state)
     assert stream.state is state
-    stream._happen(event)
+    stream._handle(event)
     assert stream.state is NEXT.get((state, event), state)
     assert (stream._link is not None) == (state in LINKED and stream.state in LINKED)
-    assert (stream in world.robot.watchers) == (stream.state is not StreamState.CLOSED)
+    assert (stream in world.robot.observers) == (stream.state is not StreamState.CLOSED)
 
 
 # --- viewers ----------------------------------------------------------------------------------------------
 
 
-def test_a_picture_goes_to_everybody_and_the_robot_is_told_at_once(world: World) -> None:
-    """With its own size, whatever the robot says, and the moment it was here."""
+def test_a_frame_goes_to_all_viewers_and_is_acknowledged_at_once(world: World) -> None:
+    """With its own size, regardless of the robot's report, and its time of arrival."""
     stream, first, end = watched(world)
     second = Watcher(user=8)
     assert second.watch(world) is stream
     shows(world, stream, 5, jpeg(48, 32))
-    assert end.all(link.Took) == [link.Took(number=5)]
+    assert end.all(link.FrameAck) == [link.FrameAck(number=5)]
     (picture,) = first.pictures
     assert second.pictures == [picture]
     assert (picture.number, picture.codec, picture.width, picture.height) == (5, "jpeg", 48, 32)
@@ -104,8 +103,8 @@ def test_a_picture_goes_to_everybody_and_the_robot_is_told_at_once(world: World)
     assert stream.newest is picture
 
 
-def test_what_the_network_held_up_is_good_for_less_long(world: World) -> None:
-    """After a stall old pictures come in a heap, which nobody shall take for what the camera sees now."""
+def test_delayed_command_is_valid_for_less_time(world: World) -> None:
+    """After a stall old frames arrive together and must not pass as new ones."""
     stream, watcher, _ = watched(world)
     for number, late in enumerate((0.0, 0.3, 2.0)):
         shows(world, stream, number, late=late)
@@ -113,28 +112,28 @@ def test_what_the_network_held_up_is_good_for_less_long(world: World) -> None:
     assert left == pytest.approx([STALE_SECONDS, STALE_SECONDS - 0.3, STALE_SECONDS - 2.0])
 
 
-def test_who_comes_while_a_camera_is_inhibited_sees_nothing_of_it(world: World) -> None:
-    """Not even the picture that its publisher keeps; that comes when it is over. One that is held is shown."""
+def test_new_viewer_of_an_inhibited_camera_gets_no_frame(world: World) -> None:
+    """Not even its latched frame, which is sent at the end. A held frame is shown."""
     stream, _, _ = watched(world)
-    stream.message(structs.replace(PLAYING, latched=True))
+    stream.message_received(structs.replace(PLAYING, latched=True))
     shows(world, stream, 1)
     inhibited = link.Inhibited(resource=stream.camera, ms=5000, by="olga")
-    world.robot.safety = structs.replace(world.robot.safety, inhibited=[inhibited])
+    world.robot.motion_state = structs.replace(world.robot.motion_state, inhibited=[inhibited])
     late = Watcher()
     late.watch(world)
     world.clock.pump([0.2] * 15)
     assert late.played and late.numbers == []
-    world.robot.safety = structs.replace(
-        world.robot.safety, inhibited=[structs.replace(inhibited, hold=True)]
+    world.robot.motion_state = structs.replace(
+        world.robot.motion_state, inhibited=[structs.replace(inhibited, hold=True)]
     )
     world.clock.advance(1)
     assert late.numbers == [1]
 
 
-def test_who_comes_later_is_told_what_the_others_know(world: World) -> None:
-    """What the robot plays, and the newest picture, if it is not too old to be shown."""
+def test_later_subscriber_gets_the_current_state(world: World) -> None:
+    """The playback status, and the newest frame if it is recent enough."""
     stream, _, _ = watched(world)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1)
     world.clock.advance(0.4)
     late = Watcher()
@@ -150,8 +149,8 @@ def test_who_comes_later_is_told_what_the_others_know(world: World) -> None:
     assert later.numbers == []
 
 
-def test_a_picture_comes_once_to_who_is_new(world: World) -> None:
-    """Also one that comes before he was greeted."""
+def test_a_new_viewer_gets_a_frame_once(world: World) -> None:
+    """Even if a frame arrives before the viewer's first status."""
     stream, _, _ = watched(world)
     shows(world, stream, 1)
     late = Watcher()
@@ -161,40 +160,40 @@ def test_a_picture_comes_once_to_who_is_new(world: World) -> None:
     assert late.numbers == [2]
 
 
-def test_who_has_left_is_told_nothing(world: World) -> None:
-    """Neither pictures nor the end, nor that none came; leaving twice is nothing."""
+def test_gone_client_receives_nothing(world: World) -> None:
+    """Neither frames nor errors; leaving twice has no effect."""
     stream, watcher, _ = watched(world)
     stays = Watcher()
     stays.watch(world)
     watcher.leave()
     watcher.leave()
     shows(world, stream)
-    world.clock.advance(FIRST_PICTURE_SECONDS + 1)
-    stream.shut(Unavailable("over"))
+    world.clock.advance(FIRST_FRAME_SECONDS + 1)
+    stream.close(Unavailable("over"))
     assert watcher.pictures == []
     assert watcher.error is None
     assert str(stays.error) == "over"
 
 
-def test_one_viewer_may_leave_while_another_is_shown_a_picture(world: World) -> None:
-    """And takes others with him."""
+def test_viewer_may_leave_during_delivery(world: World) -> None:
+    """It may even remove other viewers."""
     stream, first, _ = watched(world)
     second = Watcher()
     second.watch(world)
     for each, other in ((first, second), (second, first)):
-        each.picture = lambda picture, other=other: other.leave()  # type: ignore[method-assign]
+        each.frame_received = lambda picture, other=other: other.leave()  # type: ignore[method-assign]
     shows(world, stream)
     assert len(stream.viewers) == 1
 
 
 def test_a_stream_lingers_after_its_last_viewer(world: World) -> None:
-    """Who comes within the time finds it open; after it the robot is told to stop, within 2 s in all."""
+    """A viewer that joins in time finds it open; after that the robot is asked to stop, within 2 s in all."""
     stream, watcher, end = watched(world)
     watcher.leave()
     assert stream.state is StreamState.LINGERING
     world.clock.advance(LINGER_SECONDS - 0.1)
     shows(world, stream, 9)
-    assert end.all(link.Took) == [link.Took(number=9)]
+    assert end.all(link.FrameAck) == [link.FrameAck(number=9)]
     back = Watcher()
     assert back.watch(world) is stream
     world.clock.advance(0)
@@ -209,8 +208,8 @@ def test_a_stream_lingers_after_its_last_viewer(world: World) -> None:
     assert not [call for call in world.clock.getDelayedCalls() if call.active()]
 
 
-def test_nobody_left_before_it_opened(world: World) -> None:
-    """It is over at once; a robot that comes with its ticket is turned away."""
+def test_channel_opens_while_a_client_waits(world: World) -> None:
+    """A stream without viewers is closed at once; a robot with its ticket is refused."""
     robot_comes(world)
     watcher = Watcher()
     stream = watcher.watch(world)
@@ -225,46 +224,46 @@ def test_nobody_left_before_it_opened(world: World) -> None:
 
 
 def test_a_stream_takes_a_number_of_viewers(world: World) -> None:
-    """One more is refused in words."""
+    """One more gets an error."""
     for user in range(STREAM_VIEWERS):
         Watcher(user).watch(world)
     with pytest.raises(Unavailable, match="256 viewers watch this stream already"):
         Watcher(1000).watch(world)
 
 
-# --- no picture -------------------------------------------------------------------------------------------
+# --- no frame ---------------------------------------------------------------------------------------------
 
 
-def test_who_gets_no_picture_is_told_why(world: World) -> None:
-    """The robot is away, has no such camera, does not join, or shows nothing."""
+def test_viewer_without_frames_gets_the_reason(world: World) -> None:
+    """The robot is offline, has no such camera, does not join, or sends no frame."""
 
-    def told(settings: link.VideoSettings, camera: str = CAMERA) -> BaseException | None:
+    def reported(settings: link.VideoSettings, camera: str = CAMERA) -> BaseException | None:
         watcher = Watcher()
         watcher.watch(world, settings, camera)
         if settings.fps == 2:
             robot_joins(world)
-        world.clock.advance(FIRST_PICTURE_SECONDS - 0.1)
+        world.clock.advance(FIRST_FRAME_SECONDS - 0.1)
         assert watcher.error is None
         world.clock.advance(0.1)
         return watcher.error
 
-    assert str(told(link.VideoSettings())) == "robot rover is offline"
+    assert str(reported(link.VideoSettings())) == "robot rover is offline"
     robot_comes(world)
-    nowhere = told(link.VideoSettings(), "/nowhere")
+    nowhere = reported(link.VideoSettings(), "/nowhere")
     assert isinstance(nowhere, NotFound)
     assert str(nowhere) == NO_CAMERA
-    silent = told(link.VideoSettings(fps=1))
+    silent = reported(link.VideoSettings(fps=1))
     assert isinstance(silent, NoFrame)
-    assert "does not open the video" in str(silent)
-    dark = told(link.VideoSettings(fps=2))
+    assert "does not open the stream" in str(silent)
+    dark = reported(link.VideoSettings(fps=2))
     assert isinstance(dark, NoFrame)
-    assert "has given no picture for 10 s" in str(dark)
+    assert "has sent no frame for 10 s" in str(dark)
     world.clock.advance(LINGER_SECONDS)
     assert list(world.videos) == []
 
 
-def test_who_has_got_a_picture_waits_for_more(world: World) -> None:
-    """Also while the robot is away: an image on a page goes on when it is back."""
+def test_viewer_with_a_frame_waits_for_more(world: World) -> None:
+    """This includes an offline robot: an image on a page continues when it is back."""
     stream, watcher, end = watched(world)
     shows(world, stream, 1)
     world.robot_goes()
@@ -283,7 +282,7 @@ def test_who_has_got_a_picture_waits_for_more(world: World) -> None:
 
 
 def test_the_robot_is_asked_when_it_has_the_camera(world: World) -> None:
-    """Not before it has said so, and once."""
+    """Not before it has reported it, and only once."""
     settings = link.VideoSettings(width=320, quality=60)
     stream = Watcher().watch(world, settings)
     robot_comes(world, OTHER)
@@ -297,14 +296,14 @@ def test_the_robot_is_asked_when_it_has_the_camera(world: World) -> None:
 
 
 def test_cameras_of_a_former_registration_count_no_more(world: World) -> None:
-    """The daemon may have been started with others."""
+    """The daemon may have been restarted with other cameras."""
     robot_comes(world)
     world.registry.registered(world.robot, MemoryLink())
     assert world.robot.cameras == ()
 
 
 def test_a_robot_that_does_not_join_is_asked_again(world: World) -> None:
-    """With another ticket, as long as somebody waits; the former one is good no more."""
+    """With another ticket, as long as there is a viewer; the former ticket is invalid."""
     robot_comes(world)
     first, second = Watcher(), Watcher()
     stream = first.watch(world)
@@ -320,8 +319,8 @@ def test_a_robot_that_does_not_join_is_asked_again(world: World) -> None:
     assert world.videos.redeem(again.ticket) is stream
 
 
-def test_a_broken_link_is_opened_anew_ever_more_slowly(world: World) -> None:
-    """Until a picture has come."""
+def test_a_broken_link_is_opened_again_ever_more_slowly(world: World) -> None:
+    """Until a frame arrives."""
     stream, watcher, end = watched(world)
 
     def pause() -> float:
@@ -333,7 +332,7 @@ def test_a_broken_link_is_opened_anew_ever_more_slowly(world: World) -> None:
         return world.clock.seconds() - began
 
     shows(world, stream)
-    for expected in (REOPEN_SECONDS, 1.0, 2.0, 4.0, MOST_REOPEN_SECONDS, MOST_REOPEN_SECONDS):
+    for expected in (REOPEN_SECONDS, 1.0, 2.0, 4.0, MAX_REOPEN_SECONDS, MAX_REOPEN_SECONDS):
         assert pause() == expected
         end = robot_joins(world)
     shows(world, stream, 2)
@@ -341,8 +340,8 @@ def test_a_broken_link_is_opened_anew_ever_more_slowly(world: World) -> None:
     assert watcher.error is None
 
 
-def test_another_link_is_turned_away(world: World) -> None:
-    """What it loses is not the stream's."""
+def test_another_link_is_refused(world: World) -> None:
+    """Its loss does not affect the stream."""
     stream, _, end = watched(world)
     other = MemoryLink()
     stream.joined(other)
@@ -355,10 +354,12 @@ def test_another_link_is_turned_away(world: World) -> None:
 @pytest.mark.parametrize(
     "body", [b"<html>", b"", png(), jpeg() + b"\n", jpeg()[:-2]], ids=lambda b: repr(b[:6])
 )
-def test_what_is_no_picture_breaks_the_link_and_no_stream(world: World, body: bytes) -> None:
-    """Nobody gets it; who waits for a first picture is told, who has seen some is told and sees what comes later."""
+def test_invalid_frame_breaks_the_link_but_no_stream(world: World, body: bytes) -> None:
+    """The frame is not sent to viewers. Those without a frame get an error; others get a status and later
+    frames.
+    """
     stream, watcher, end = watched(world)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1)
     world.clock.advance(STALE_SECONDS + 1)
     late = Watcher()
@@ -366,44 +367,44 @@ def test_what_is_no_picture_breaks_the_link_and_no_stream(world: World, body: by
     with pytest.raises(MalformedMessage):
         shows(world, stream, 2, body)
     assert watcher.numbers == [1] and watcher.error is None
-    assert str(late.error).startswith("robot rover sent what is no picture: ")
-    assert watcher.played[-1].trouble == str(late.error)
-    assert stream.failed == watcher.played[-1]
+    assert str(late.error).startswith("robot rover sent a frame that is not an image: ")
+    assert watcher.played[-1].problem == str(late.error)
+    assert stream.last_status == watcher.played[-1]
     assert end.closed is None, "it is the connection that says why"
-    assert end.all(link.Took) == [link.Took(number=1), link.Took(number=2)]
+    assert end.all(link.FrameAck) == [link.FrameAck(number=1), link.FrameAck(number=2)]
     world.clock.advance(REOPEN_SECONDS)
     robot_joins(world)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1)
     assert watcher.numbers == [1, 1]
-    assert stream.failed is None
+    assert stream.last_status is None
 
 
-def test_what_is_no_picture_ends_a_stream_that_has_shown_none(world: World) -> None:
-    """Everybody is told."""
+def test_invalid_first_frame_ends_the_stream(world: World) -> None:
+    """Every viewer gets the error."""
     stream, watcher, _ = watched(world)
     with pytest.raises(MalformedMessage):
         shows(world, stream, 1, b"<html>")
-    assert str(watcher.error).startswith("robot rover sent what is no picture: ")
+    assert str(watcher.error).startswith("robot rover sent a frame that is not an image: ")
     assert stream.state is StreamState.CLOSED
 
 
 def test_a_robot_that_can_not_show_it_any_more_is_asked_again(world: World) -> None:
-    """Less and less often, as long as anybody watches who has seen pictures; he is told why none comes."""
+    """With growing pauses, as long as a viewer has seen frames; it gets the reason."""
     stream, watcher, end = watched(world)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1)
     pause = REOPEN_SECONDS
     for _ in range(8):
-        stream.message(link.NotPlaying(reason="the JPEG ends in the middle"))
+        stream.message_received(link.StreamRefused(reason="the JPEG ends in the middle"))
         assert end.closed and stream.state is StreamState.OPENING
         world.clock.advance(pause / 2)
         assert asked(world) == []
         world.clock.advance(pause / 2)
         end = robot_joins(world)
-        pause = min(2 * pause, MOST_REOPEN_SECONDS)
+        pause = min(2 * pause, MAX_REOPEN_SECONDS)
     assert watcher.error is None
-    assert [each.trouble for each in watcher.played] == ["", "the JPEG ends in the middle"]
+    assert [each.problem for each in watcher.played] == ["", "the JPEG ends in the middle"]
     shows(world, stream, 1)
     assert watcher.numbers == [1, 1]
     watcher.leave()
@@ -411,24 +412,24 @@ def test_a_robot_that_can_not_show_it_any_more_is_asked_again(world: World) -> N
     assert stream.state is StreamState.CLOSED
 
 
-def test_a_viewer_who_waits_for_his_first_picture_in_a_bad_spell_is_told_what_is_wrong(world: World) -> None:
-    """With the words of the robot, when his patience is over; who has seen some stays."""
+def test_a_viewer_without_a_first_frame_learns_the_reason(world: World) -> None:
+    """The reason is the robot's, at the viewer's timeout; viewers that have seen frames stay."""
     stream, watcher, _ = watched(world)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1)
     world.clock.advance(STALE_SECONDS + 1)
-    stream.message(structs.replace(PLAYING, trouble="the PNG is broken"))
+    stream.message_received(structs.replace(PLAYING, problem="the PNG is broken"))
     late = Watcher()
     late.watch(world)
-    world.clock.advance(FIRST_PICTURE_SECONDS)
-    assert str(late.error) == "camera /camera/image has given no picture for 10 s: the PNG is broken"
-    assert watcher.error is None and watcher.played[-1].trouble == "the PNG is broken"
+    world.clock.advance(FIRST_FRAME_SECONDS)
+    assert str(late.error) == "camera /camera/image has sent no frame for 10 s: the PNG is broken"
+    assert watcher.error is None and watcher.played[-1].problem == "the PNG is broken"
 
 
-def test_a_robot_that_can_not_show_it_says_why(world: World) -> None:
-    """The viewers hear it, and the stream is over."""
+def test_a_robot_that_refuses_a_stream_gives_the_reason(world: World) -> None:
+    """Its viewers get the reason, and the stream ends."""
     stream, watcher, end = watched(world)
-    stream.message(link.NotPlaying(reason="no module named av"))
+    stream.message_received(link.StreamRefused(reason="no module named av"))
     assert type(watcher.error) is Unavailable
     assert str(watcher.error) == "no module named av"
     assert stream.state is StreamState.CLOSED
@@ -436,59 +437,59 @@ def test_a_robot_that_can_not_show_it_says_why(world: World) -> None:
 
 
 @pytest.mark.parametrize("busy", [False, True])
-def test_of_h264_it_is_told_whether_another_codec_may_do(world: World, busy: bool) -> None:
-    """Not when the robot only makes too many streams."""
+def test_a_refusal_of_h264_shows_whether_another_codec_is_available(world: World, busy: bool) -> None:
+    """A robot with too many streams does not suggest another codec."""
     stream, watcher, _ = watched(world, H264)
-    stream.message(link.NotPlaying(reason="no module named av", busy=busy))
+    stream.message_received(link.StreamRefused(reason="no module named av", busy=busy))
     assert type(watcher.error) is (Unavailable if busy else EncoderUnavailable)
     assert str(watcher.error) == "no module named av"
 
 
-def test_h264_that_is_none_is_the_encoders_fault(world: World) -> None:
-    """JPEG may be better."""
+def test_invalid_h264_is_the_encoders_fault(world: World) -> None:
+    """JPEG may work."""
     stream, watcher, _ = watched(world, H264)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     with pytest.raises(MalformedMessage):
         shows(world, stream, 1, b"<html>")
     assert type(watcher.error) is EncoderUnavailable
 
 
-def test_what_the_robot_plays_is_told_when_it_changes(world: World) -> None:
-    """And kept, until its link is gone."""
+def test_playback_is_reported_when_it_changes(world: World) -> None:
+    """The status is kept until its link is closed."""
     stream, watcher, end = watched(world)
-    less = link.Playing(width=16, height=12, quality=40, reduced=0.5)
-    stream.message(PLAYING)
-    stream.message(PLAYING)
-    stream.message(less)
-    assert stream.told == less
+    less = link.StreamStatus(width=16, height=12, quality=40, reduced=0.5)
+    stream.message_received(PLAYING)
+    stream.message_received(PLAYING)
+    stream.message_received(less)
+    assert stream.status == less
     world.clock.advance(1)
     assert watcher.played == [PLAYING, less]
     stream.lost(end)
-    assert stream.told is None
+    assert stream.status is None
     world.clock.advance(REOPEN_SECONDS)
     robot_joins(world)
-    stream.message(less)
+    stream.message_received(less)
     assert watcher.played == [PLAYING, less, less]
 
 
-def test_a_robot_that_says_without_end_what_it_plays_is_told_of_ten_times_a_second(world: World) -> None:
-    """The first at once, then the newest; who comes meanwhile hears that, and nobody anything once it is over."""
+def test_endless_stream_statuses_are_passed_on_ten_times_a_second(world: World) -> None:
+    """The first at once, then the newest. New viewers get it too, and no viewer gets any after the end."""
     stream, watcher, _ = watched(world)
-    playing = [link.Playing(width=16 + number, height=12, quality=40) for number in range(1000)]
+    playing = [link.StreamStatus(width=16 + number, height=12, quality=40) for number in range(1000)]
     for each in playing:
-        stream.message(each)
+        stream.message_received(each)
     assert watcher.played == playing[:1]
     late = Watcher()
     late.watch(world)
-    world.clock.advance(TELL_SECONDS)
+    world.clock.advance(STATUS_SECONDS)
     assert watcher.played == [playing[0], playing[-1]]
     assert set(late.played) == {playing[-1]}
     for number in range(100):
-        stream.message(playing[number])
-        world.clock.advance(TELL_SECONDS / 10)
+        stream.message_received(playing[number])
+        world.clock.advance(STATUS_SECONDS / 10)
     assert len(watcher.played) == pytest.approx(2 + 10, abs=1)
-    stream.message(PLAYING)
-    stream.shut(Unavailable("over"))
+    stream.message_received(PLAYING)
+    stream.close(Unavailable("over"))
     world.clock.advance(1)
     assert PLAYING not in watcher.played
 
@@ -497,19 +498,19 @@ def test_a_robot_that_says_without_end_what_it_plays_is_told_of_ten_times_a_seco
 
 
 def test_h264_is_shown_from_a_key_frame_on(world: World) -> None:
-    """The robot is asked for one when somebody comes; its size is what the robot plays."""
+    """A new viewer causes a request for one; its size is that of the playback status."""
     stream, first, end = watched(world, H264)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1, KEY)
     shows(world, stream, 2, DELTA)
     assert [(each.key, each.width, each.height) for each in first.pictures] == [
         (True, 32, 24),
         (False, 32, 24),
     ]
-    assert end.take(link.KeyFrame) == []
+    assert end.take(link.RequestKeyFrame) == []
     second = Watcher()
     second.watch(world, H264)
-    assert len(end.take(link.KeyFrame)) == 1
+    assert len(end.take(link.RequestKeyFrame)) == 1
     shows(world, stream, 3, DELTA)
     shows(world, stream, 4, KEY)
     shows(world, stream, 5, DELTA)
@@ -519,45 +520,45 @@ def test_h264_is_shown_from_a_key_frame_on(world: World) -> None:
 
 
 def test_key_frames_are_asked_for_now_and_then(world: World) -> None:
-    """Twice a second, the first time at once, whoever comes; and not for who has one already."""
+    """At most twice a second, the first time at once, and not for viewers that have one."""
     stream, _, end = watched(world, H264)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     for _ in range(20):
         Watcher().watch(world, H264)
         world.clock.advance(0.1)
-    assert len(end.take(link.KeyFrame)) == 1 + 2 * 2
+    assert len(end.take(link.RequestKeyFrame)) == 1 + 2 * 2
     Watcher().watch(world, H264)
     shows(world, stream, 1, KEY)
     world.clock.advance(5)
-    assert end.take(link.KeyFrame) == []
+    assert end.take(link.RequestKeyFrame) == []
 
 
-def test_a_viewer_that_left_out_a_picture_starts_anew(world: World) -> None:
-    """What follows is of no use to him; the others see it."""
+def test_a_viewer_that_skipped_a_frame_starts_with_a_key_frame(world: World) -> None:
+    """The frames that follow are useless to it; others get them."""
     stream, slow, end = watched(world, H264)
     fast = Watcher()
     fast.watch(world, H264)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1, KEY)
     world.clock.advance(KEY_SECONDS)
-    end.take(link.KeyFrame)
-    stream.start_anew(slow)
-    assert len(end.take(link.KeyFrame)) == 1
+    end.take(link.RequestKeyFrame)
+    stream.request_keyframe(slow)
+    assert len(end.take(link.RequestKeyFrame)) == 1
     shows(world, stream, 2, DELTA)
     shows(world, stream, 3, KEY)
     assert slow.numbers == [1, 3]
     assert fast.numbers == [1, 2, 3]
 
 
-def test_after_a_break_everybody_starts_anew(world: World) -> None:
-    """The robot's encoder is another one."""
+def test_after_a_break_all_viewers_start_with_a_key_frame(world: World) -> None:
+    """The robot's encoder has been restarted."""
     stream, watcher, end = watched(world, H264)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1, KEY)
     stream.lost(end)
     world.clock.advance(REOPEN_SECONDS)
     robot_joins(world)
-    stream.message(PLAYING)
+    stream.message_received(PLAYING)
     shows(world, stream, 1, DELTA)
     assert watcher.numbers == [1]
     shows(world, stream, 2, KEY)
@@ -565,8 +566,8 @@ def test_after_a_break_everybody_starts_anew(world: World) -> None:
 
 
 def test_h264_without_a_size_breaks_the_contract(world: World) -> None:
-    """``playing`` comes before the first picture."""
+    """``stream_status`` must precede the first frame."""
     stream, watcher, _ = watched(world, H264)
-    with pytest.raises(MalformedMessage, match="before 'playing'"):
+    with pytest.raises(MalformedMessage, match="before 'stream_status'"):
         shows(world, stream, 1, KEY)
     assert watcher.error is not None

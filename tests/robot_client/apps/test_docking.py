@@ -1,4 +1,4 @@
-"""What battery, markers and scanner tell of the way to a charger."""
+"""Battery, markers and scanner on the path to a charger."""
 
 from __future__ import annotations
 
@@ -8,11 +8,19 @@ from typing import Any
 
 import pytest
 
-from robot_client.apps.docking import Approach, Charge, Need, Sighting, charge, sighting, way_ahead
+from robot_client.apps.recharge import (
+    Approach,
+    Charge,
+    ChargeNeed,
+    Sighting,
+    clearance_ahead,
+    parse_battery,
+    parse_marker,
+)
 
 
 @pytest.mark.parametrize(
-    ("share", "status", "told"),
+    ("share", "status", "reported"),
     [
         (0.5, 2, Charge(0.5, 2)),
         (1, 4, Charge(1.0, 4)),
@@ -22,19 +30,19 @@ from robot_client.apps.docking import Approach, Charge, Need, Sighting, charge, 
         ("0.5", 2, None),
     ],
 )
-def test_a_battery_tells_its_charge_or_nothing(share: Any, status: Any, told: Charge | None) -> None:
-    """NaN comes as null; per cent are no share."""
-    assert charge({"percentage": share, "power_supply_status": status}) == told
+def test_a_battery_has_a_charge_or_none(share: Any, status: Any, reported: Charge | None) -> None:
+    """NaN arrives as null; percentages are invalid."""
+    assert parse_battery({"percentage": share, "power_supply_status": status}) == reported
 
 
 def test_a_battery_needs_charging_from_low_until_it_has_enough() -> None:
-    """In between it stays as it was; one that is full has enough."""
-    need = Need(0.2, 0.8)
+    """Between the thresholds the state stays; a full battery is charged enough."""
+    need = ChargeNeed(0.2, 0.8)
     wanted = [(0.5, False), (0.19, True), (0.5, True), (0.79, True), (0.8, False), (0.3, False), (0.1, True)]
     for share, urgent in wanted:
-        need.see(Charge(share, 2))
+        need.update(Charge(share, 2))
         assert need.urgent is urgent
-    need.see(Charge(0.1, 4))
+    need.update(Charge(0.1, 4))
     assert not need.urgent
 
 
@@ -43,10 +51,10 @@ def seen(*markers: Any) -> str:
 
 
 def test_a_marker_is_found_by_its_number() -> None:
-    """Among others, or not."""
+    """Among others; it may be missing."""
     text = seen({"id": 1, "distance": 1.0, "bearing": 0.0}, {"id": 7, "distance": 2.5, "bearing": -0.2})
-    assert sighting(text, 7) == Sighting(2.5, -0.2)
-    assert sighting(text, 3) is None
+    assert parse_marker(text, 7) == Sighting(2.5, -0.2)
+    assert parse_marker(text, 3) is None
 
 
 @pytest.mark.parametrize(
@@ -66,34 +74,34 @@ def test_a_marker_is_found_by_its_number() -> None:
         '{"markers": [{"id": 7, "distance": 1.0, "bearing": Infinity}]}',
     ],
 )
-def test_what_makes_no_sense_is_no_marker(text: Any) -> None:
-    """Whatever comes on the topic."""
-    assert sighting(text, 7) is None
+def test_invalid_bits_are_no_marker(text: Any) -> None:
+    """For any message on the topic."""
+    assert parse_marker(text, 7) is None
 
 
 def scan(*ranges: Any, begin: float = 0.0, step: float = math.pi / 2) -> dict[str, Any]:
     return {"ranges": list(ranges), "angle_min": begin, "angle_increment": step}
 
 
-def test_what_is_ahead_is_in_the_way() -> None:
-    """What is to the side, behind, or not there is not."""
-    assert way_ahead(scan(0.8, 0.1, 0.1, 0.1)) == pytest.approx(0.8)
-    assert way_ahead(scan(None, 0.3, 0.2, None)) == math.inf
+def test_obstacle_ahead_blocks() -> None:
+    """Obstacles beside and behind do not, nor do missing ones."""
+    assert clearance_ahead(scan(0.8, 0.1, 0.1, 0.1)) == pytest.approx(0.8)
+    assert clearance_ahead(scan(None, 0.3, 0.2, None)) == math.inf
     aside = math.radians(30)
-    assert way_ahead(scan(0.4, begin=aside)) == pytest.approx(0.4 * math.cos(aside))
-    assert way_ahead(scan(1.0, begin=aside)) == math.inf
+    assert clearance_ahead(scan(0.4, begin=aside)) == pytest.approx(0.4 * math.cos(aside))
+    assert clearance_ahead(scan(1.0, begin=aside)) == math.inf
 
 
 @pytest.mark.parametrize(
     "message", [{}, scan(), scan(None, None), scan("a"), {"ranges": 3, "angle_min": 0, "angle_increment": 1}]
 )
-def test_a_scan_that_tells_nothing_is_none(message: dict[str, Any]) -> None:
-    """No ray that has measured anything, or none at all."""
-    assert way_ahead(message) is None
+def test_a_scan_without_ranges_is_none(message: dict[str, Any]) -> None:
+    """Without a valid ray, or without any ray."""
+    assert clearance_ahead(message) is None
 
 
 def test_it_drives_slower_the_nearer_it_is_and_turns_to_the_marker() -> None:
-    """Never faster than it may; a marker that is far aside is turned to first."""
+    """Never faster than its limit; first it turns to a marker far aside."""
     approach = Approach(0.45, 0.3, 0.5)
     assert approach.command(Sighting(3.0, 0.1)) == (0.3, pytest.approx(0.15))
     speeds = [approach.command(Sighting(each, 0.0)).speed for each in (1.2, 0.8, 0.6, 0.46)]

@@ -1,130 +1,130 @@
-"""Driving by one line: what is said to the relay, and what follows from what it says."""
+"""Driving over one connection: messages to the relay, and the effects of its answers."""
 
 from __future__ import annotations
 
 import pytest
-from switchboard_socket import Socket
 
 from robot_client.apps.connection import Lost, RosbridgeConnection
 from robot_client.apps.driver import (
-    BEAT,
-    LATE,
-    SILENT,
-    STILL,
+    LOST_SECONDS,
+    PING_SECONDS,
+    UNRESPONSIVE_SECONDS,
+    ZERO_VELOCITY,
     Driver,
     MaximumSpeeds,
-    StopNotice,
+    StopRequest,
     VelocityCommand,
 )
+from tests.worlds.memory_socket import Socket
 
 
 class Scene:
-    """A driver, what it says, and the time."""
+    """A driver, its messages, and the time."""
 
     def __init__(self) -> None:
         self.now = 100.0
-        self.stop = StopNotice()
+        self.stop = StopRequest()
         self.connect()
         self.beat()
 
     def connect(self) -> None:
-        """A new line."""
+        """Makes a new connection."""
         self.socket = Socket()
         self.driver = Driver(
             RosbridgeConnection(self.socket), "/cmd_vel", "test", lambda: self.now, self.stop
         )
 
     def beat(self) -> None:
-        """Have the first look at the way answered."""
-        self.driver.hear(0.0)
+        """Answers the first ping through the relay."""
+        self.driver.poll(0.0)
         self.socket.answer(service="/relay/ping")
         self.hear()
 
     def hear(self) -> None:
-        """All that comes."""
+        """Reads all messages."""
         while self.socket.coming:
-            self.driver.hear(0.0)
+            self.driver.poll(0.0)
 
     def take(self) -> None:
-        """Have control."""
-        self.driver.take()
+        """Takes control."""
+        self.driver.request_control()
         self.socket.answer(service="/relay/take_control")
         self.hear()
 
 
 def test_it_drives_only_in_control() -> None:
-    """Before it has it, and after, nothing is said to the robot."""
+    """Before and after it has control, no command is sent."""
     scene = Scene()
     scene.driver.drive(VelocityCommand(0.2, 0.0))
     assert scene.socket.driven() == []
     scene.take()
     scene.driver.drive(VelocityCommand(0.2, 0.1))
-    scene.driver.give_back()
+    scene.driver.release_control()
     scene.driver.drive(VelocityCommand(0.2, 0.0))
     assert scene.socket.driven() == [(0.2, 0.1), (0.0, 0.0)]
     assert scene.socket.asked()[-1]["service"] == "/relay/release_control"
 
 
 def test_control_is_asked_for_once_until_it_is_answered() -> None:
-    """However often somebody wants it."""
+    """For any number of attempts."""
     scene = Scene()
-    scene.driver.take()
-    scene.driver.take()
+    scene.driver.request_control()
+    scene.driver.request_control()
     assert len(scene.socket.asked("/relay/take_control")) == 1
 
 
-def test_control_that_is_refused_is_told_in_the_relays_words() -> None:
-    """Both ways of saying no."""
+def test_refused_control_is_reported_in_the_relays_words() -> None:
+    """For both forms of a refusal."""
     scene = Scene()
-    scene.driver.take()
+    scene.driver.request_control()
     scene.socket.answer(success=False, service="/relay/take_control")
     scene.hear()
-    assert (scene.driver.in_control, scene.driver.said) == (False, "no")
-    scene.driver.take()
-    assert scene.driver.said == ""
+    assert (scene.driver.in_control, scene.driver.refusal) == (False, "no")
+    scene.driver.request_control()
+    assert scene.driver.refusal == ""
     scene.socket.answer(result=False, service="/relay/take_control")
     scene.hear()
-    assert scene.driver.said == "you may not"
+    assert scene.driver.refusal == "you may not"
 
 
-def test_control_that_was_given_back_before_the_answer_came_is_not_had() -> None:
-    """The relay has been told so as well."""
+def test_control_released_before_the_answer_is_not_acquired() -> None:
+    """The release was sent to the relay as well."""
     scene = Scene()
-    scene.driver.take()
+    scene.driver.request_control()
     number = len(scene.socket.sent)
-    scene.driver.give_back()
+    scene.driver.release_control()
     assert scene.socket.sent[number]["service"] == "/relay/release_control"
     scene.socket.answer(service="/relay/take_control")
     scene.hear()
     assert not scene.driver.in_control
 
 
-def test_control_that_is_lost_is_heard() -> None:
-    """And why; then not even a zero is said, which nobody would obey."""
+def test_loss_of_control_is_received() -> None:
+    """With the reason; then not even a zero is sent, which would be refused."""
     scene = Scene()
     scene.take()
     scene.driver.drive(VelocityCommand(0.2, 0.0))
     scene.socket.control(holder="somebody")
     scene.hear()
-    assert (scene.driver.in_control, scene.driver.obstacle) == (False, "somebody has control")
-    scene.driver.still()
+    assert (scene.driver.in_control, scene.driver.blocked_by) == (False, "somebody has control")
+    scene.driver.halt()
     assert scene.socket.driven() == [(0.2, 0.0)]
 
 
 def test_a_robot_that_is_stopped_can_not_be_driven() -> None:
-    """Until it is not."""
+    """Until it is resumed."""
     scene = Scene()
     scene.socket.control(holder="me", you=True, stopped="somebody")
     scene.hear()
-    assert "stopped by somebody" in scene.driver.obstacle
+    assert "stopped by somebody" in scene.driver.blocked_by
     scene.socket.control(holder="me", you=True)
     scene.hear()
-    assert scene.driver.obstacle == ""
+    assert scene.driver.blocked_by == ""
     assert scene.driver.in_control
 
 
 def test_the_robots_limits_of_the_level_count() -> None:
-    """Those of the other level do not; without any the command goes as it is."""
+    """Those of the other level do not; without limits the command is unchanged."""
     scene = Scene()
     scene.take()
     scene.driver.drive(VelocityCommand(2.0, -3.0))
@@ -137,19 +137,19 @@ def test_the_robots_limits_of_the_level_count() -> None:
     assert scene.socket.driven() == [(2.0, -3.0), (-0.5, -3.0)]
 
 
-def test_zero_is_said_once() -> None:
-    """And not where nothing was under way."""
+def test_zero_is_sent_once() -> None:
+    """Not if there was no motion."""
     scene = Scene()
     scene.take()
-    scene.driver.still()
+    scene.driver.halt()
     scene.driver.drive(VelocityCommand(0.2, 0.0))
-    scene.driver.still()
-    scene.driver.still()
-    assert scene.socket.driven() == [(0.2, 0.0), STILL]
+    scene.driver.halt()
+    scene.driver.halt()
+    assert scene.socket.driven() == [(0.2, 0.0), ZERO_VELOCITY]
 
 
 def test_a_stop_needs_no_control() -> None:
-    """In control it is zero first."""
+    """With control a zero comes first."""
     scene = Scene()
     scene.driver.stop()
     assert scene.socket.sent[-1]["service"] == "/relay/stop"
@@ -161,46 +161,46 @@ def test_a_stop_needs_no_control() -> None:
 
 
 def test_how_long_the_robot_takes_to_answer_is_known() -> None:
-    """It is asked again and again, once at a time."""
+    """It is pinged repeatedly, one ping at a time."""
     scene = Scene()
-    scene.now += BEAT
-    scene.driver.hear(0.0)
+    scene.now += PING_SECONDS
+    scene.driver.poll(0.0)
     scene.now += 0.05
-    scene.driver.hear(0.0)
+    scene.driver.poll(0.0)
     assert len(scene.socket.asked("/relay/ping")) == 2
     scene.socket.answer(service="/relay/ping")
     scene.hear()
     assert scene.driver.round_trip == pytest.approx(0.05)
-    assert not scene.driver.late
+    assert not scene.driver.unresponsive
 
 
 def test_a_robot_that_does_not_answer_is_late_and_then_lost() -> None:
-    """Whatever the system says of the connection."""
+    """For any state of the connection in the system."""
     scene = Scene()
-    scene.now += BEAT
-    scene.driver.hear(0.0)
-    scene.now += LATE + 0.1
-    scene.driver.hear(0.0)
-    assert scene.driver.late
-    scene.now += SILENT
+    scene.now += PING_SECONDS
+    scene.driver.poll(0.0)
+    scene.now += UNRESPONSIVE_SECONDS + 0.1
+    scene.driver.poll(0.0)
+    assert scene.driver.unresponsive
+    scene.now += LOST_SECONDS
     with pytest.raises(Lost, match="has not answered"):
-        scene.driver.hear(0.0)
+        scene.driver.poll(0.0)
 
 
-def test_that_somebody_suppresses_the_topic_is_known() -> None:
-    """This topic, however its name begins; another does not matter."""
+def test_suppression_of_the_topic_is_known() -> None:
+    """This topic, with or without a leading slash; other topics do not matter."""
     scene = Scene()
-    told = []
+    reported = []
     for names in (["/other"], ["/other", "cmd_vel"], []):
         scene.socket.control(holder="me", you=True)
         scene.socket.coming[-1]["msg"]["suppressed"] = [{"resource": each} for each in names]
         scene.hear()
-        told.append(scene.driver.suppressed)
-    assert told == [False, True, False]
+        reported.append(scene.driver.suppressed)
+    assert reported == [False, True, False]
 
 
 def test_a_stop_that_was_not_answered_comes_first_by_the_next_line() -> None:
-    """Answered there it is over."""
+    """Its answer ends it."""
     scene = Scene()
     scene.driver.stop()
     scene.connect()
@@ -212,7 +212,7 @@ def test_a_stop_that_was_not_answered_comes_first_by_the_next_line() -> None:
 
 
 def test_a_stop_that_a_broken_line_does_not_take_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor where the zero before it is what breaks."""
+    """Even if the zero before it breaks the connection."""
     scene = Scene()
     scene.take()
     scene.driver.drive(VelocityCommand(0.2, 0.0))
@@ -231,50 +231,56 @@ def test_a_stop_that_a_broken_line_does_not_take_is_not_forgotten(monkeypatch: p
     ("result", "values", "words", "done"),
     [
         (True, {"success": True, "message": "", "done": True}, "is stopped until it is resumed", True),
-        (True, {"success": True, "message": "", "done": False}, "as soon as it is back", False),
-        (True, {"success": False, "message": "no brakes", "done": False}, "no brakes", False),
+        (True, {"success": True, "message": "", "done": False}, "as soon as it is online", False),
+        (True, {"success": False, "message": "no brakes", "done": False}, "stop not done: no brakes", False),
+        (
+            True,
+            {"success": False, "message": "it is stopped, but", "done": False, "stopped": {"by": "ann"}},
+            "stop: it is stopped, but",
+            False,
+        ),
         (False, "you may not", "you may not", False),
     ],
-    ids=["done", "later", "not done", "refused"],
+    ids=["done", "later", "not done", "done in part", "refused"],
 )
-def test_what_became_of_a_stop_is_told_in_words(result: bool, values: object, words: str, done: bool) -> None:
-    """Until the answer comes it was asked for, no more."""
+def test_result_of_a_stop_is_worded(result: bool, values: object, words: str, done: bool) -> None:
+    """Before the answer it is only "requested"."""
     scene = Scene()
     scene.driver.stop()
-    assert (scene.stop.asked, scene.stop.words) == (True, "stop asked for, not answered yet")
+    assert (scene.stop.pending, scene.stop.text) == (True, "stop requested, not confirmed yet")
     scene.socket.answer(service="/relay/stop")
     scene.socket.coming[-1].update(result=result, values=values)
     scene.hear()
-    assert words in scene.stop.words
-    assert (scene.stop.asked, scene.stop.done) == (False, done)
+    assert words in scene.stop.text
+    assert (scene.stop.pending, scene.stop.done) == (False, done)
 
 
 def test_of_two_stops_the_answer_to_the_last_one_counts() -> None:
-    """The first may be of a stop that was resumed since."""
+    """The first answer may belong to a stop that has been resumed."""
     scene = Scene()
     scene.driver.stop()
     scene.socket.answer(service="/relay/stop")
     scene.driver.stop()
     scene.hear()
-    assert scene.stop.asked
+    assert scene.stop.pending
     scene.socket.answer(service="/relay/stop")
     scene.hear()
-    assert not scene.stop.asked
+    assert not scene.stop.pending
 
 
 def test_a_request_is_taken_back() -> None:
-    """An answer that comes later gives no control."""
+    """A later answer gives no control."""
     scene = Scene()
-    scene.driver.take()
-    scene.driver.withdraw()
+    scene.driver.request_control()
+    scene.driver.withdraw_request()
     assert scene.socket.asked()[-1]["service"] == "/relay/release_control"
     scene.socket.answer(service="/relay/take_control")
     scene.hear()
     assert not scene.driver.in_control
 
 
-def test_what_comes_on_the_programs_own_topics_is_handed_over() -> None:
-    """As it came."""
+def test_messages_on_the_programs_topics_are_delivered() -> None:
+    """Unchanged."""
     heard: list[tuple[str, object]] = []
     socket = Socket()
     driver = Driver(
@@ -282,9 +288,9 @@ def test_what_comes_on_the_programs_own_topics_is_handed_over() -> None:
         "/cmd_vel",
         "test",
         lambda: 0.0,
-        StopNotice(),
+        StopRequest(),
         lambda *each: heard.append(each),
     )
     socket.coming.append({"op": "publish", "topic": "/scan", "msg": {"ranges": []}})
-    driver.hear(0.0)
+    driver.poll(0.0)
     assert heard == [("/scan", {"ranges": []})]

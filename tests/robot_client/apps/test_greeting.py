@@ -1,4 +1,4 @@
-"""The greeting program, with a websocket and a memory in memory."""
+"""The greeting program, with a websocket and an event log in memory."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from switchboard_socket import Socket
 
 from robot_client.apps.connection import Lost, RosbridgeConnection
-from robot_client.apps.event_client import Unanswered
+from robot_client.apps.event_client import EventLogUnavailable
 from robot_client.apps.greeting import (
-    BEAT,
     BEGUN,
-    CHECK,
+    CONFIRM_SECONDS,
     GREETED,
-    SILENT,
+    LOST_SECONDS,
+    PING_SECONDS,
+    RECHECK_SECONDS,
     STRANGER,
-    SURE,
     Greeting,
     GreetingConfig,
     main,
-    persons,
+    person_names,
 )
+from tests.worlds.memory_socket import Socket
 
 FACES = "/faces/seen"
 
 
 class Remembered:
-    """A relay's memory, which programs share."""
+    """A relay's event log, shared by programs."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -69,27 +69,27 @@ class Remembered:
     def _answered(self, what: str) -> None:
         if what == self.fails_at:
             self.fails_at = ""
-            raise Unanswered("the relay does not answer")
+            raise EventLogUnavailable("the relay does not answer")
 
 
 class Scene:
-    """A program at work."""
+    """A running program."""
 
-    def __init__(self, memory: Remembered, manners: GreetingConfig | None = None) -> None:
+    def __init__(self, memory: Remembered, config: GreetingConfig | None = None) -> None:
         self.memory = memory
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.program = Greeting(
-            FACES, "/say", memory, manners or GreetingConfig(), self.told.append, lambda: self.memory.now
+            FACES, "/say", memory, config or GreetingConfig(), self.reported.append, lambda: self.memory.now
         )
         self.connect()
 
     def connect(self) -> None:
-        """A new line."""
+        """Makes a new connection."""
         self.socket = Socket()
         self.program.begin(RosbridgeConnection(self.socket))
 
     def see(self, *names: str | None, times: int = 2, seconds: float = 0.2) -> None:
-        """Pictures with these people in them."""
+        """Sends images with these persons."""
         text = json.dumps({"faces": [{"name": name} for name in names]})
         for _ in range(times):
             self.memory.now += seconds
@@ -106,17 +106,17 @@ def kinds(memory: Remembered) -> list[str]:
     return [each["kind"] for each in memory.written]
 
 
-def test_who_comes_is_greeted_once(memory: Remembered) -> None:
-    """However long he stays; each person by his name."""
+def test_arriving_person_is_greeted_once(memory: Remembered) -> None:
+    """For any length of stay; each person by name."""
     scene = Scene(memory)
     scene.see("ann", times=100)
     scene.see("ann", "bob", times=3)
     assert memory.said == ["Hello, ann.", "Hello, bob."]
     assert kinds(memory) == [BEGUN, GREETED] * 2
-    assert "greeted ann" in scene.told
+    assert "greeted ann" in scene.reported
 
 
-def test_after_a_minute_he_is_greeted_again(memory: Remembered) -> None:
+def test_a_person_is_greeted_again_after_a_minute(memory: Remembered) -> None:
     """Not before."""
     scene = Scene(memory)
     scene.see("ann")
@@ -126,48 +126,48 @@ def test_after_a_minute_he_is_greeted_again(memory: Remembered) -> None:
     assert memory.said == ["Hello, ann."] * 2
 
 
-def test_one_picture_may_be_wrong(memory: Remembered) -> None:
-    """Nobody is greeted by one alone, nor by two that are far apart."""
+def test_single_wrong_frame_is_tolerated(memory: Remembered) -> None:
+    """A single image causes no greeting, nor do two that are far apart."""
     scene = Scene(memory)
     scene.see("ann", times=1)
-    scene.see("ann", times=1, seconds=SURE + 0.1)
+    scene.see("ann", times=1, seconds=CONFIRM_SECONDS + 0.1)
     assert memory.said == []
 
 
-def test_a_program_that_is_started_anew_greets_nobody_twice(memory: Remembered) -> None:
-    """The relay remembers."""
+def test_a_restarted_program_greets_no_person_twice(memory: Remembered) -> None:
+    """The relay has the event."""
     Scene(memory).see("ann")
     again = Scene(memory)
     again.see("ann")
     assert memory.said == ["Hello, ann."]
-    assert again.told[-1] == "ann was greeted already"
+    assert again.reported[-1] == "ann was greeted already"
 
 
 def test_of_two_that_ask_at_the_same_time_one_greets(memory: Remembered) -> None:
-    """Both heard that nobody has; who wrote first greets."""
+    """Both found no earlier greeting; the first event counts."""
     one, other = Scene(memory), Scene(memory)
-    # While the one has just been told that nobody has greeted her, the other does all of it.
+    # While the first program has just read that there is no greeting, the second does all steps.
     memory.between = lambda: other.see("ann")
     one.see("ann")
     assert memory.said == ["Hello, ann."]
     assert kinds(memory) == [BEGUN, GREETED, BEGUN]
-    assert one.told[-1] == "ann is greeted by another program"
+    assert one.reported[-1] == "ann is greeted by another program"
 
 
 @pytest.mark.parametrize("fails_at", ["events", BEGUN, "publish", GREETED])
 def test_a_relay_that_is_lost_in_the_middle_greets_at_most_once(memory: Remembered, fails_at: str) -> None:
-    """What was not answered may have been done; the program goes on."""
+    """A request without an answer may have been executed; the program continues."""
     scene = Scene(memory)
     memory.fails_at = fails_at
     scene.see("ann")
-    assert scene.told[-1] == "ann is not greeted: the relay does not answer"
+    assert scene.reported[-1] == "ann is not greeted: the relay does not answer"
     scene.see("ann", times=20, seconds=1.0)
     assert memory.said == ([] if fails_at == BEGUN else ["Hello, ann."])
     scene.see("ann", times=60, seconds=1.0)
     assert len(memory.said) == (1 if fails_at == BEGUN else 2)
 
 
-def test_strangers_are_greeted_where_that_is_wanted(memory: Remembered) -> None:
+def test_strangers_are_greeted_where_configured(memory: Remembered) -> None:
     """All of them as one person."""
     Scene(memory).see(None, None)
     assert memory.said == []
@@ -177,7 +177,7 @@ def test_strangers_are_greeted_where_that_is_wanted(memory: Remembered) -> None:
 
 
 def test_the_text_is_as_one_likes(memory: Remembered) -> None:
-    """Braces in it or in a name are letters."""
+    """Braces in the text or in a name are literal."""
     Scene(memory, GreetingConfig(text="{hi} {name}!")).see("{0}")
     assert memory.said == ["{hi} {0}!"]
 
@@ -196,54 +196,54 @@ def test_the_text_is_as_one_likes(memory: Remembered) -> None:
         json.dumps({"faces": [{"name": "x" * 65}]}),
     ],
 )
-def test_what_makes_no_sense_is_nobody(text: Any) -> None:
-    """Whatever comes on the topic."""
-    assert persons(text, True) == []
+def test_unusable_image_shows_no_face(text: Any) -> None:
+    """For any message on the topic."""
+    assert person_names(text, True) == []
 
 
-def test_the_relay_is_asked_about_somebody_now_and_then(memory: Remembered) -> None:
-    """Not with each picture."""
+def test_the_relay_is_queried_about_a_person_periodically(memory: Remembered) -> None:
+    """Not for each image."""
     scene = Scene(memory)
     scene.see("ann")
     memory.questions = 0
-    scene.see("ann", times=round(5 * CHECK / 0.1), seconds=0.1)
+    scene.see("ann", times=round(5 * RECHECK_SECONDS / 0.1), seconds=0.1)
     assert 4 <= memory.questions <= 5
 
 
 def test_a_line_on_which_nothing_comes_is_lost(memory: Remembered) -> None:
-    """It is asked before, and said when it is."""
+    """It is pinged before, and its loss is reported."""
     scene = Scene(memory)
-    memory.now += BEAT
+    memory.now += PING_SECONDS
     scene.program.step()
     assert len(scene.socket.asked("/relay/ping")) == 1
-    memory.now += SILENT
+    memory.now += LOST_SECONDS
     with pytest.raises(Lost):
         scene.program.step()
     scene.program.lost("gone", 0.5)
-    assert scene.told[-1] == "gone; again in 0.5 s"
+    assert scene.reported[-1] == "gone; again in 0.5 s"
     scene.connect()
     scene.see("ann")
     assert memory.said == ["Hello, ann."]
 
 
-def test_what_the_relay_refuses_is_told(memory: Remembered) -> None:
-    """As a topic that may not be heard."""
+def test_refusal_of_the_relay_is_reported(memory: Remembered) -> None:
+    """For example a topic without the right to subscribe."""
     scene = Scene(memory)
     scene.socket.coming.append({"op": "status", "level": "error", "msg": "you may not"})
     scene.program.step()
-    assert scene.told[-1] == "refused: you may not"
+    assert scene.reported[-1] == "refused: you may not"
 
 
 @pytest.mark.parametrize(
     ("arguments", "token", "words"),
     [
         (["ws://127.0.0.1:1/robots/r"], "", "SWITCHBOARD_TOKEN"),
-        (["http://127.0.0.1:1/"], "t", "is no address of a robot"),
+        (["http://127.0.0.1:1/"], "t", "is not the address of a robot"),
         (["ws://127.0.0.1:1/robots/r", "--within", "0"], "t", "--within"),
     ],
 )
-def test_what_is_wrong_is_said_in_words(arguments: list[str], token: str, words: str) -> None:
-    """No token, no robot's address, options that make no sense."""
+def test_error_is_explained(arguments: list[str], token: str, words: str) -> None:
+    """No token, no robot's address, invalid options."""
     done = CliRunner().invoke(main, arguments, env={"SWITCHBOARD_TOKEN": token})
     assert done.exit_code != 0
     assert words in done.output

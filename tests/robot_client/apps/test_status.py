@@ -1,10 +1,10 @@
-"""The line that says how things stand."""
+"""The status line of a program."""
 
 from __future__ import annotations
 
 import io
 
-from robot_client.apps.status_line import EVERY, StatusLine
+from robot_client.apps.program import UPDATE_SECONDS, StatusLine
 
 
 class Screen(io.StringIO):
@@ -15,24 +15,24 @@ class Screen(io.StringIO):
 
 
 def test_in_a_file_each_change_is_a_line() -> None:
-    """What changes all the time is left out."""
+    """Values that change all the time are left out."""
     out = io.StringIO()
     line = StatusLine(out, lambda: 0.0)
     for state, details in [("ready", "1"), ("ready", "2"), ("driving", "3"), ("ready", "4")]:
-        line.tell(state, details)
-    line.end("ended")
+        line.show(state, details)
+    line.finish("ended")
     assert out.getvalue() == "ready\ndriving\nready\nended\n"
 
 
 def test_on_a_terminal_the_line_is_written_over() -> None:
-    """Now and then with what changes all the time, at once with another state."""
+    """From time to time with changing values, at once with a new state."""
     now = 0.0
     out = Screen()
     line = StatusLine(out, lambda: now)
-    line.tell("driving", "1")
-    line.tell("driving", "2")
-    now += EVERY
-    line.tell("driving", "3")
-    line.tell("ready", "4")
-    line.end("ended")
+    line.show("driving", "1")
+    line.show("driving", "2")
+    now += UPDATE_SECONDS
+    line.show("driving", "3")
+    line.show("ready", "4")
+    line.finish("ended")
     assert out.getvalue().replace("\r\x1b[K", "|") == "|driving  1|driving  3|ready  4|ended  \n"

@@ -6,13 +6,20 @@ from collections.abc import Iterator
 
 import pytest
 from click.testing import CliRunner
-from switchboard_socket import Socket
 
 from robot_client.apps.audio import Block
 from robot_client.apps.command_words import CommandWord, WordCommands
 from robot_client.apps.connection import RosbridgeConnection
-from robot_client.apps.driver import BEAT, LATE, MaximumSpeeds
-from robot_client.apps.voice import KEEP, STALE, RecognisedWord, RecognitionThread, VoiceControl, main
+from robot_client.apps.driver import PING_SECONDS, UNRESPONSIVE_SECONDS, MaximumSpeeds
+from robot_client.apps.voice import (
+    MAX_WORD_AGE,
+    RELEASE_AFTER,
+    RecognisedWord,
+    RecognitionThread,
+    VoiceControl,
+    main,
+)
+from tests.worlds.memory_socket import Socket
 
 
 class Said:
@@ -22,38 +29,38 @@ class Said:
         self.ended = False
         self.words: list[RecognisedWord] = []
 
-    def heard(self) -> Iterator[RecognisedWord]:
+    def take_words(self) -> Iterator[RecognisedWord]:
         while self.words:
             yield self.words.pop(0)
 
 
 class Scene:
-    """The program at work."""
+    """A running program."""
 
     def __init__(self, latch: bool = False) -> None:
         self.now = 100.0
         self.said = Said()
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.program = VoiceControl(
             self.said,
             WordCommands(1.5),
             "/cmd_vel",
             MaximumSpeeds(0.4, 1.0),
             latch,
-            lambda state, _: self.told.append(state),
+            lambda state, _: self.reported.append(state),
             lambda: self.now,
         )
         self.goes_on = True
         self.connect()
 
     def connect(self) -> None:
-        """A new line."""
+        """Makes a new connection."""
         self.socket = Socket()
         self.socket.reached = True
         self.program.begin(RosbridgeConnection(self.socket))
 
     def step(self, *words: CommandWord, seconds: float = 0.06, age: float = 0.0) -> list[tuple[float, float]]:
-        """One step in which these were said; what was said to the robot then."""
+        """One step with these words; returns the commands."""
         before = len(self.socket.driven())
         self.now += seconds
         self.said.words += [RecognisedWord(each, self.now - age) for each in words]
@@ -63,13 +70,13 @@ class Scene:
         return self.socket.driven()[before:]
 
     def take(self) -> None:
-        """Have control."""
+        """Takes control."""
         self.socket.control(holder="me", you=True)
         self.step()
 
 
 def test_a_word_takes_control_and_then_moves_the_robot() -> None:
-    """For a second and a half, then it stands."""
+    """For 1.5 s, then it stands."""
     scene = Scene()
     assert scene.step(CommandWord.AHEAD) == []
     assert len(scene.socket.asked("/relay/take_control")) == 1
@@ -82,20 +89,20 @@ def test_a_word_takes_control_and_then_moves_the_robot() -> None:
 
 
 def test_without_control_a_word_is_not_done_later() -> None:
-    """Refused, or given when the word is long over."""
+    """Control may be refused, or granted when the word has expired."""
     scene = Scene()
     scene.step(CommandWord.AHEAD)
     scene.socket.answer(success=False, service="/relay/take_control")
     assert scene.step() == []
-    assert "not done: no" in scene.told[-1]
+    assert "not done: no" in scene.reported[-1]
     scene.step(CommandWord.LEFT)
-    scene.step(seconds=STALE + 0.1)
+    scene.step(seconds=MAX_WORD_AGE + 0.1)
     scene.take()
     assert scene.step() == []
 
 
 def test_stop_is_zero_at_once() -> None:
-    """In control it does not latch: the next word moves the robot."""
+    """With control it does not latch: the next word moves the robot."""
     scene = Scene()
     scene.take()
     scene.step(CommandWord.AHEAD)
@@ -106,7 +113,7 @@ def test_stop_is_zero_at_once() -> None:
 
 
 def test_stop_without_control_is_the_relays_stop() -> None:
-    """A zero would not be obeyed there."""
+    """A zero would be refused then."""
     scene = Scene()
     scene.socket.control(holder="somebody")
     scene.step()
@@ -114,8 +121,8 @@ def test_stop_without_control_is_the_relays_stop() -> None:
     assert len(scene.socket.asked("/relay/stop")) == 1
 
 
-def test_stop_while_somebody_suppresses_the_topic_is_the_relays_stop() -> None:
-    """A zero would not be obeyed there either."""
+def test_stop_during_suppression_is_the_relays_stop() -> None:
+    """A zero would be refused then too."""
     scene = Scene()
     scene.socket.control(holder="me", you=True)
     scene.socket.coming[-1]["msg"]["suppressed"] = [{"resource": "/cmd_vel"}]
@@ -125,36 +132,36 @@ def test_stop_while_somebody_suppresses_the_topic_is_the_relays_stop() -> None:
 
 
 def test_stop_where_the_robot_is_late_is_the_relays_stop() -> None:
-    """A zero could be lost on the way; that stop is not."""
+    """A zero could be lost on the late link; the relay's stop is not."""
     scene = Scene()
     scene.take()
     scene.socket.reached = False
-    scene.step(seconds=BEAT)
-    scene.step(seconds=LATE + 0.1)
+    scene.step(seconds=PING_SECONDS)
+    scene.step(seconds=UNRESPONSIVE_SECONDS + 0.1)
     scene.step(CommandWord.STOP)
     assert len(scene.socket.asked("/relay/stop")) == 1
 
 
 def test_stop_in_control_is_zero_also_where_no_word_moved_the_robot() -> None:
-    """Whoever drove before may have left it moving."""
+    """An earlier driver may have left it moving."""
     scene = Scene()
     scene.take()
     assert scene.step(CommandWord.STOP) == [(0.0, 0.0)]
 
 
-def test_a_stop_is_told_as_asked_for_and_then_as_answered() -> None:
-    """It is not done because it was said."""
+def test_a_stop_is_reported_as_requested_and_then_as_answered() -> None:
+    """Sending it does not count as done."""
     scene = Scene()
     scene.step(CommandWord.STOP)
-    assert scene.told[-1] == "stop asked for, not answered yet"
+    assert scene.reported[-1] == "stop requested, not confirmed yet"
     scene.socket.answer(service="/relay/stop")
     scene.socket.coming[-1]["values"]["done"] = False
     scene.step()
-    assert "as soon as it is back" in scene.told[-1]
+    assert "as soon as it is online" in scene.reported[-1]
 
 
-def test_a_stop_that_was_not_answered_is_said_again_by_the_next_connection() -> None:
-    """The program does not end before, though nothing more is to be heard."""
+def test_an_unanswered_stop_is_sent_again_by_the_next_connection() -> None:
+    """The program does not end before, even if no more speech follows."""
     scene = Scene()
     scene.said.ended = True
     scene.step(CommandWord.STOP)
@@ -162,14 +169,14 @@ def test_a_stop_that_was_not_answered_is_said_again_by_the_next_connection() -> 
     scene.program.lost("gone", 0.1)
     scene.connect()
     assert scene.socket.sent[0]["service"] == "/relay/stop"
-    assert scene.told[-1] == "stop asked for, not answered yet"
+    assert scene.reported[-1] == "stop requested, not confirmed yet"
     scene.socket.answer(service="/relay/stop")
     scene.step()
     assert not scene.goes_on
 
 
-def test_a_stop_that_is_said_without_a_connection_is_done_by_the_next() -> None:
-    """Of all words it alone."""
+def test_a_stop_spoken_without_a_connection_is_sent_by_the_next() -> None:
+    """No other word is kept."""
     scene = Scene()
     scene.program.lost("gone", 0.1)
     scene.said.words += [
@@ -182,15 +189,15 @@ def test_a_stop_that_is_said_without_a_connection_is_done_by_the_next() -> None:
 
 
 def test_a_word_that_waited_while_the_program_stood_still_moves_nothing() -> None:
-    """Though control was given meanwhile."""
+    """Even if control was granted meanwhile."""
     scene = Scene()
     scene.step(CommandWord.AHEAD)
     scene.socket.answer(service="/relay/take_control")
-    assert scene.step(seconds=STALE + 0.5) == []
-    assert "ahead: not done: heard too late" in scene.told
+    assert scene.step(seconds=MAX_WORD_AGE + 0.5) == []
+    assert "ahead: not done: too late" in scene.reported
 
 
-def test_stop_is_the_relays_stop_always_where_that_is_wanted() -> None:
+def test_stop_is_always_the_relays_stop_where_configured() -> None:
     """After the zero."""
     scene = Scene(latch=True)
     scene.take()
@@ -202,17 +209,17 @@ def test_stop_is_the_relays_stop_always_where_that_is_wanted() -> None:
 
 
 def test_a_word_that_comes_too_late_moves_nothing() -> None:
-    """But *stop* counts however late it comes."""
+    """*stop* counts at any age."""
     scene = Scene()
     scene.take()
-    assert scene.step(CommandWord.AHEAD, age=STALE + 0.1) == []
-    assert "too late" in scene.told[-1]
+    assert scene.step(CommandWord.AHEAD, age=MAX_WORD_AGE + 0.1) == []
+    assert "too late" in scene.reported[-1]
     scene.step(CommandWord.AHEAD)
     assert scene.step(CommandWord.STOP, age=10.0) == [(0.0, 0.0)]
 
 
-def test_what_was_said_without_a_connection_does_not_count() -> None:
-    """Nor does what was under way before."""
+def test_speech_without_a_connection_does_not_count() -> None:
+    """Nor do earlier words continue."""
     scene = Scene()
     scene.take()
     scene.step(CommandWord.AHEAD)
@@ -224,8 +231,8 @@ def test_what_was_said_without_a_connection_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("who", ["stopped", "taken"])
-def test_a_robot_that_is_stopped_or_anothers_is_let_go_of(who: str) -> None:
-    """What was under way is not done later."""
+def test_a_robot_that_is_stopped_or_controlled_by_another_is_released(who: str) -> None:
+    """Earlier words are not executed later."""
     scene = Scene()
     scene.take()
     scene.step(CommandWord.AHEAD)
@@ -238,41 +245,41 @@ def test_a_robot_that_is_stopped_or_anothers_is_let_go_of(who: str) -> None:
     assert scene.step() == []
 
 
-def test_a_word_to_a_robot_that_is_stopped_is_told_so() -> None:
-    """And moves nothing."""
+def test_a_word_to_a_stopped_robot_is_answered_so() -> None:
+    """It moves nothing."""
     scene = Scene()
     scene.socket.control(holder="me", you=True, stopped="somebody")
     scene.step()
     assert scene.step(CommandWord.AHEAD) == []
-    assert "stopped by somebody" in scene.told[-1]
+    assert "stopped by somebody" in scene.reported[-1]
 
 
-def test_a_link_that_is_late_lets_go() -> None:
-    """The robot stands, and a word is told why."""
+def test_a_late_link_releases_control() -> None:
+    """The robot stands, and a word gets the reason."""
     scene = Scene()
     scene.take()
     scene.step(CommandWord.AHEAD)
     scene.socket.reached = False
-    scene.step(seconds=BEAT)
-    assert scene.step(seconds=LATE + 0.1) == [(0.0, 0.0)]
+    scene.step(seconds=PING_SECONDS)
+    assert scene.step(seconds=UNRESPONSIVE_SECONDS + 0.1) == [(0.0, 0.0)]
     assert scene.step(CommandWord.AHEAD) == []
-    assert "does not answer" in scene.told[-1]
+    assert "does not answer" in scene.reported[-1]
 
 
-def test_control_is_given_back_when_nothing_is_said() -> None:
+def test_control_is_released_after_silence() -> None:
     """So that others can drive."""
     scene = Scene()
     scene.take()
     scene.step(CommandWord.AHEAD)
-    for _ in range(round(KEEP / 0.5)):
+    for _ in range(round(RELEASE_AFTER / 0.5)):
         assert scene.socket.asked("/relay/release_control") == []
         scene.step(seconds=0.5)
     scene.step(seconds=0.5)
     assert len(scene.socket.asked("/relay/release_control")) == 1
 
 
-def test_it_ends_when_all_was_said_and_done() -> None:
-    """Not in the middle of the last word."""
+def test_it_ends_after_the_last_word_was_executed() -> None:
+    """The last word is completed."""
     scene = Scene()
     scene.take()
     scene.said.ended = True
@@ -298,16 +305,16 @@ def test_the_end_is_zero_and_gives_control_back() -> None:
 
 
 class _Ear:
-    def hear(self, data: bytes) -> list[tuple[CommandWord, float]]:
+    def recognize(self, data: bytes) -> list[tuple[CommandWord, float]]:
         return [(CommandWord.LEFT, 0.25)] if data == b"left" else []
 
 
 def test_a_word_is_as_old_as_its_end() -> None:
-    """By the moment of the block it was found in."""
+    """By the time of the block in which it was recognised."""
     listening = RecognitionThread([Block(b"", 9.0), Block(b"left", 10.0)], _Ear())
     listening.start()
     listening.join()
-    assert list(listening.heard()) == [RecognisedWord(CommandWord.LEFT, 9.75)]
+    assert list(listening.take_words()) == [RecognisedWord(CommandWord.LEFT, 9.75)]
     assert listening.ended
 
 
@@ -315,13 +322,13 @@ def test_a_word_is_as_old_as_its_end() -> None:
     ("arguments", "token", "words"),
     [
         ([], "", "SWITCHBOARD_TOKEN"),
-        (["--wav", "/dev/null"], "t", "can't be read as WAV"),
+        (["--wav", "/dev/null"], "t", "cannot read"),
         (["--wav", "/dev/null", "--pcm"], "t", "one of"),
         (["--seconds", "60"], "t", "--seconds"),
     ],
 )
-def test_what_is_wrong_is_said_in_words(arguments: list[str], token: str, words: str) -> None:
-    """No token, no sound, two sources, a word that would act for too long."""
+def test_error_is_explained(arguments: list[str], token: str, words: str) -> None:
+    """No token, no sound, two sources, a word with too long an effect."""
     done = CliRunner().invoke(
         main, ["ws://127.0.0.1:1/robots/r", *arguments], env={"SWITCHBOARD_TOKEN": token}
     )

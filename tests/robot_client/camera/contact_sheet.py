@@ -17,33 +17,40 @@ import cv2
 import numpy as np
 
 from relay_protocol.link import VideoSettings
-from robot_client.camera.encoding import Jpeg, Png, make_encoder
-from robot_client.camera.formats import ENCODINGS, Raw, compressed, decoded, image, unpacked
+from robot_client.camera.encoder import JpegEncoder, PngEncoder, build_encoder
+from robot_client.camera.formats import (
+    ENCODINGS,
+    RawImage,
+    compressed_file,
+    decode_compressed,
+    decode_file,
+    decode_image,
+)
 from robot_client.camera.transforms import plan_transforms
-from tests.robot_client.camera.cards import Pixels, card, coded, compressed_cdr, depth_files, image_cdr
+from tests.worlds.image_cards import Pixels, card, coded, compressed_cdr, depth_files, image_cdr
 
 WIDTH, HEIGHT, COLUMNS, TITLE = 240, 180, 6, 24
 NOON = 1_763_726_400.789
 
 
 def stills() -> dict[str, Pixels]:
-    """Titles and BGR pictures: each went through the JPEG that a viewer gets."""
+    """Titles and BGR images, each decoded from a viewer's JPEG."""
     shown = {}
     for encoding in ENCODINGS:
         for title, cdr in {
             encoding: image_cdr(coded(encoding, big_endian=False, padding=24)),
             f"{encoding}, big endian": image_cdr(coded(encoding, big_endian=True), order=">"),
         }.items():
-            shown[title] = _edited(image(cdr))
+            shown[title] = _edited(decode_image(cdr))
     for format_, file in depth_files().items():
-        shown[format_.strip()] = _edited(unpacked(compressed(compressed_cdr(file, format_))))
+        shown[format_.strip()] = _edited(decode_compressed(compressed_file(compressed_cdr(file, format_))))
     bgr = np.ascontiguousarray(card(WIDTH, HEIGHT)[:, :, ::-1])
-    for kind, encoder in (("jpeg", Jpeg()), ("png", Png())):
-        shown[f"{kind}, passed through"] = decoded(
-            compressed(compressed_cdr(encoder.encode(bgr, 80, True)[0]))[1]
+    for kind, encoder in (("jpeg", JpegEncoder()), ("png", PngEncoder())):
+        shown[f"{kind}, passed through"] = decode_file(
+            compressed_file(compressed_cdr(encoder.encode(bgr, 80, True)[0]))[1]
         ).pixels
     webp = cv2.imencode(".webp", bgr, (cv2.IMWRITE_WEBP_QUALITY, 80))[1].tobytes()
-    shown["webp"] = _edited(unpacked(compressed(compressed_cdr(webp, "webp"))))
+    shown["webp"] = _edited(decode_compressed(compressed_file(compressed_cdr(webp, "webp"))))
     for title, changed in {
         "crop 80,60,80,60": {"crop": (80, 60, 80, 60)},
         "rotate 90": {"rotate": 90},
@@ -52,19 +59,19 @@ def stills() -> dict[str, Pixels]:
         "1920 wide, stamp": {"width": 1920, "stamp": True},
     }.items():
         shown[title] = plan_transforms(VideoSettings(**changed), WIDTH, HEIGHT).apply(bgr, NOON)
-    picture, _ = make_encoder("h264", WIDTH, HEIGHT, 15).encode(bgr, 80, True)
+    picture, _ = build_encoder("h264", WIDTH, HEIGHT, 15).encode(bgr, 80, True)
     shown["h264, key frame"] = h264_decoded([picture])[0]
     return shown
 
 
-def _edited(raw: Raw) -> Pixels:
+def _edited(raw: RawImage) -> Pixels:
     settings = VideoSettings(width=WIDTH, height=HEIGHT, stamp=True)
     edited = plan_transforms(settings, raw.width, raw.height).apply(raw.pixels, NOON)
-    return decoded(Jpeg().encode(edited, 80, True)[0]).pixels
+    return decode_file(JpegEncoder().encode(edited, 80, True)[0]).pixels
 
 
 def h264_decoded(pictures: list[bytes]) -> list[Pixels]:
-    """BGR of each picture of a stream."""
+    """BGR of each frame of a stream."""
     context = av.VideoCodecContext.create("h264", "r")
     frames = [frame for picture in pictures for frame in context.decode(av.Packet(picture))]
     return [frame.to_ndarray(format="bgr24") for frame in [*frames, *context.decode(None)]]
@@ -94,4 +101,4 @@ def sheet(shown: dict[str, Pixels]) -> Pixels:
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_bytes(Png().encode(sheet(stills()), 100, True)[0])
+    Path(sys.argv[1]).write_bytes(PngEncoder().encode(sheet(stills()), 100, True)[0])

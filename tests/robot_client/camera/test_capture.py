@@ -1,4 +1,4 @@
-"""Cameras without ROS: files, and a camera of the network on loopback. No device can be had in a test."""
+"""Cameras without ROS: files, and a network camera on loopback. Tests cannot have a real device."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from switchboard_rtsp import RtspCamera, card, number_of
 
 from robot_client.camera import capture
 from robot_client.camera.capture import Capture
 from robot_client.camera.formats import Pixels
+from tests.worlds.rtsp_camera import RtspCamera, card, number_of
 
-PATIENCE = 60.0
+DRAIN_TIMEOUT = 60.0
 LOGIN = "ann:s3cret"
 
 
@@ -30,27 +30,29 @@ def film(path: Path, pictures: int) -> str:
 
 
 class Seen:
-    def __init__(self, source: str, silence: float = PATIENCE) -> None:
+    def __init__(self, source: str, silence: float = DRAIN_TIMEOUT) -> None:
         self.pictures: queue.Queue[Pixels] = queue.Queue()
-        self.told: queue.Queue[tuple[str, str]] = queue.Queue()
-        self.capture = Capture(source, self.pictures.put, lambda *told: self.told.put(told), silence)
+        self.reported: queue.Queue[tuple[str, str]] = queue.Queue()
+        self.capture = Capture(
+            source, self.pictures.put, lambda *reported: self.reported.put(reported), silence
+        )
 
     def grey(self) -> int:
-        """Of the next picture, in steps of the film."""
-        return round(float(self.pictures.get(timeout=PATIENCE).mean()) / 40)
+        """The grey value of the next frame, in steps of the film."""
+        return round(float(self.pictures.get(timeout=DRAIN_TIMEOUT).mean()) / 40)
 
-    def hears(self) -> tuple[str, str]:
-        """The next that is told: its level, and the words."""
-        return self.told.get(timeout=PATIENCE)
+    def received(self) -> tuple[str, str]:
+        """The next report: its level and text."""
+        return self.reported.get(timeout=DRAIN_TIMEOUT)
 
 
 @pytest.fixture(autouse=True)
 def all_threads_end() -> Iterator[None]:
-    """Those of captures that were closed, soon after the camera is gone."""
+    """Threads of closed captures end soon after the camera has gone."""
     yield
     for thread in threading.enumerate():
         if thread.name == "capture":
-            thread.join(PATIENCE)
+            thread.join(DRAIN_TIMEOUT)
             assert not thread.is_alive()
 
 
@@ -66,89 +68,89 @@ def plain(path: Path) -> str:
 
 @pytest.mark.parametrize("source", [plain, Path.as_uri])
 def test_file_is_shown_over_and_over(tmp_path: Path, source: Callable[[Path], str]) -> None:
-    """At its end it is opened again, and nobody is told of any trouble; its name may be an address."""
+    """At its end it is opened again, without a report; its name may be a URL."""
     path = tmp_path / "a film.avi"
     film(path, 3)
     seen = Seen(source(path))
     with closing(seen.capture):
         assert [seen.grey() for _ in range(7)] == [0, 1, 2, 0, 1, 2, 0]
-    assert seen.told.empty()
+    assert seen.reported.empty()
 
 
 def test_camera_that_comes_later_is_found(tmp_path: Path) -> None:
-    """What can't be read is told once and tried again until it can, which is told too."""
+    """An unreadable source is reported once and retried; success is reported too."""
     path = tmp_path / "film.avi"
     seen = Seen(str(path))
     with closing(seen.capture):
-        assert seen.hears() == ("warn", f"can't be opened: there is no {path}; it is tried again")
+        assert seen.received() == ("warn", f"can't be opened: there is no {path}; trying again")
         film(tmp_path / "other.avi", 1)
         (tmp_path / "other.avi").rename(path)
         assert seen.grey() == 0
-        assert seen.hears() == ("info", "gives pictures again")
-    assert seen.told.empty()
+        assert seen.received() == ("info", "delivers frames again")
+    assert seen.reported.empty()
 
 
-def test_camera_of_the_network_shows_its_pictures(camera: RtspCamera) -> None:
-    """One after the other, in its size and colours, with the login in its address; not those that were there before it
-    was known what they are.
+def test_camera_of_the_network_shows_its_frames(camera: RtspCamera) -> None:
+    """In order, with its size and colours, with the login in its address; frames from before the stream was
+    parsed are dropped.
     """
     seen = Seen(camera.url)
     with closing(seen.capture):
-        shown = [seen.pictures.get(timeout=PATIENCE) for _ in range(12)]
+        shown = [seen.pictures.get(timeout=DRAIN_TIMEOUT) for _ in range(12)]
     first = number_of(shown[0])
     assert first > 2
     for number, pixels in enumerate(shown, first):
         assert pixels.shape == card(0).shape
         assert np.abs(pixels.astype(int) - card(number)).mean() < 5
-    assert seen.told.empty()
+    assert seen.reported.empty()
 
 
 def test_camera_of_the_network_that_went_away_is_found_again(camera: RtspCamera) -> None:
-    """Told once, by itself, on the same address."""
+    """Reported once, by itself, at the same address."""
     seen = Seen(camera.url)
     with closing(seen.capture):
         seen.grey()
         camera.close()
-        assert seen.hears() == ("warn", "gives no pictures; it is tried again")
+        assert seen.received() == ("warn", "delivers no frames; trying again")
         with closing(RtspCamera(camera.port, LOGIN)):
-            assert seen.hears() == ("info", "gives pictures again")
-            assert seen.told.empty()
+            assert seen.received() == ("info", "delivers frames again")
+            assert seen.reported.empty()
 
 
 def test_camera_of_the_network_that_falls_silent_is_opened_again(camera: RtspCamera) -> None:
-    """In the middle of its pictures, of which none is kept back but one that may not be whole; and before the first."""
+    """Between frames, all of which are shown except an incomplete one; and before the first frame."""
     seen = Seen(camera.url, silence=3)
     with closing(seen.capture):
-        last = seen.pictures.get(timeout=PATIENCE)
+        last = seen.pictures.get(timeout=DRAIN_TIMEOUT)
         camera.stall()
-        assert seen.hears() == ("warn", "gives no pictures; it is tried again")
+        assert seen.received() == ("warn", "delivers no frames; trying again")
         while not seen.pictures.empty():
             last = seen.pictures.get()
         assert camera.newest - number_of(last) <= 1
         visits = camera.visits
         camera.goes_on()
-        assert seen.hears() == ("info", "gives pictures again")
+        assert seen.received() == ("info", "delivers frames again")
         assert camera.visits > visits
     camera.stall()
     mute = Seen(camera.url, silence=0.5)
     with closing(mute.capture):
-        assert mute.hears()[1].startswith("can't be reached")
+        assert mute.received()[1].startswith("can't be reached")
 
 
-def test_wrong_login_is_told_without_it(
+def test_wrong_login_is_reported_without_it(
     camera: RtspCamera, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing of the address is: neither by the words, nor by what OpenCV writes to standard error."""
+    """No part of the address is shown: neither in the reports, nor in OpenCV's standard error."""
     monkeypatch.setattr(capture, "RETRY", (0.01, 0.01))
     seen = Seen(f"rtsp://bob:hunter2@127.0.0.1:{camera.port}/front?password=hunter3")
     with closing(seen.capture):
-        told = " ".join(seen.hears())
+        reported = " ".join(seen.received())
         while camera.visits < 3:
-            threading.Event().wait(0.05)  # for the next tries, whose words would be the same
+            threading.Event().wait(0.05)  # for the next tries, with equal reports
     written = capfd.readouterr()
-    assert "password" in told
+    assert "password" in reported
     for secret in ("bob", "hunter", str(camera.port)):
-        assert secret not in told
+        assert secret not in reported
     assert "hunter" not in written.out + written.err
 
 
@@ -157,28 +159,28 @@ def test_wrong_login_is_told_without_it(
     [
         ("/dev/no-camera", "there is no /dev/no-camera"),
         ("/dev/no-camera?width=640&height=480&format=MJPG", "there is no /dev/no-camera;"),
-        ("/dev/null", "gives no pictures"),
+        ("/dev/null", "delivers no frames"),
     ],
 )
-def test_device_that_is_missing_or_no_camera_is_told(device: str, why: str) -> None:
-    """By its path, which is no secret."""
+def test_device_that_is_missing_or_no_camera_is_reported(device: str, why: str) -> None:
+    """By its path, which is not secret."""
     seen = Seen(f"v4l2:{device}")
     with closing(seen.capture):
-        level, words = seen.hears()
+        level, words = seen.received()
     assert level == "warn"
     assert why in words
 
 
 def test_device_is_opened_by_its_driver_alone(tmp_path: Path) -> None:
-    """What others could read is refused where a device is asked for."""
+    """Files that other drivers could read are refused as devices."""
     seen = Seen(f"v4l2:{film(tmp_path / 'film.avi', 2)}")
     with closing(seen.capture):
-        assert seen.hears()[1].startswith("can't be opened")
+        assert seen.received()[1].startswith("can't be opened")
     assert seen.pictures.empty()
 
 
 class Device:
-    """A device of the kernel, as OpenCV has it."""
+    """A device of the kernel, as OpenCV sees it."""
 
     opened: list[tuple[object, ...]]
     asked: list[tuple[int, float]]
@@ -219,10 +221,10 @@ class Device:
         ("v4l2:/dev/video9?fps=5", [(cv2.CAP_PROP_FPS, 5)]),
     ],
 )
-def test_device_is_asked_for_what_is_wanted_of_it(
+def test_device_gets_the_configured_settings(
     monkeypatch: pytest.MonkeyPatch, source: str, asked: list[tuple[int, float]]
 ) -> None:
-    """The format first, on which sizes and rates depend; and for no more pictures than one in advance."""
+    """The format first, which determines sizes and rates; with a buffer of one frame."""
     monkeypatch.setattr(cv2, "VideoCapture", Device)
     seen = Seen(source)
     with closing(seen.capture):
@@ -238,4 +240,4 @@ def test_closed_capture_reads_no_more(tmp_path: Path) -> None:
     seen.capture.close()
     with pytest.raises(queue.Empty):
         while True:
-            seen.pictures.get(timeout=0.5)  # what comes later than this would come for ever
+            seen.pictures.get(timeout=0.5)  # anything later than this would never end

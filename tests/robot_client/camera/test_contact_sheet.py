@@ -1,14 +1,14 @@
-"""The sheet that is made to be looked at."""
+"""The contact sheet for visual review."""
 
 from __future__ import annotations
 
 from robot_client.camera.formats import ENCODINGS
-from tests.robot_client.camera.cards import depth_files
 from tests.robot_client.camera.contact_sheet import sheet, stills
+from tests.worlds.image_cards import depth_files
 
 
 def test_every_encoding_is_on_the_sheet() -> None:
-    """Both byte orders of it, the files, depth in PNG, edits and H.264; drawn to the last."""
+    """In both byte orders, with the files, depth in PNG, edits and H.264."""
     shown = stills()
     titles = [title.partition(",")[0] for title in shown]
     assert {*ENCODINGS, "jpeg", "png", "invert", "h264"} <= set(titles)

@@ -1,4 +1,4 @@
-"""What a device of the kernel is asked for, as settings write it."""
+"""Requests to a kernel device, as written in settings."""
 
 from __future__ import annotations
 
@@ -26,38 +26,38 @@ from robot_client.camera.device import CameraDevice, read_device
         ),
     ],
 )
-def test_what_is_asked_for_stands_behind_the_path(source: str, device: CameraDevice) -> None:
-    """In any order; what is left out is the driver's to choose."""
+def test_query_follows_the_path(source: str, device: CameraDevice) -> None:
+    """In any order; missing values are chosen by the driver."""
     assert read_device(source) == device
 
 
 @pytest.mark.parametrize(
     ("query", "words"),
     [
-        ("width=0&height=720", "width has to be 1 to 8192 pixels, as a whole number; it is '0'"),
-        ("width=8193&height=720", "width has to be 1 to 8192 pixels"),
-        ("width=1280&height=-1", "height has to be 1 to 8192 pixels"),
-        ("width=1280&height=", "height has to be 1 to 8192 pixels"),
+        ("width=0&height=720", r"width must be a whole number from 1 to 8192 \(pixels\); it is '0'"),
+        ("width=8193&height=720", "width must be a whole number from 1 to 8192"),
+        ("width=1280&height=-1", "height must be a whole number from 1 to 8192"),
+        ("width=1280&height=", "height must be a whole number from 1 to 8192"),
         ("width=12e2&height=720", "it is '12e2'"),
-        ("width=\N{ARABIC-INDIC DIGIT ONE}&height=720", "width has to be"),
-        (f"width={'9' * 5000}&height=720", "width has to be"),
-        ("fps=0", "fps has to be 1 to 240 pictures per second"),
-        ("fps=241", "fps has to be 1 to 240 pictures per second"),
-        ("fps=7.5", "as a whole number; it is '7.5'"),
-        ("format=MJPEG", "four letters, such as MJPG or YUYV; it is 'MJPEG'"),
-        ("format=", "four letters"),
-        ("format=MJP%0a", "four letters"),
-        ("format=MJP\N{LATIN CAPITAL LETTER G WITH BREVE}", "four letters"),
-        ("width=1280", "set together"),
-        ("height=720", "set together"),
-        ("size=1280x720", "'size' can't be set; there are width, height, fps and format"),
-        ("Width=1280&height=720", "'Width' can't be set"),
+        ("width=\N{ARABIC-INDIC DIGIT ONE}&height=720", "width must be"),
+        (f"width={'9' * 5000}&height=720", "width must be"),
+        ("fps=0", "fps must be a whole number from 1 to 240"),
+        ("fps=241", "fps must be a whole number from 1 to 240"),
+        ("fps=7.5", "it is '7.5'"),
+        ("format=MJPEG", "a FourCC such as MJPG or YUYV; it is 'MJPEG'"),
+        ("format=", "FourCC"),
+        ("format=MJP%0a", "FourCC"),
+        ("format=MJP\N{LATIN CAPITAL LETTER G WITH BREVE}", "FourCC"),
+        ("width=1280", "set both"),
+        ("height=720", "set both"),
+        ("size=1280x720", "'size' is not a setting; there are width, height, fps and format"),
+        ("Width=1280&height=720", "'Width' is not a setting"),
         ("fps=5&fps=30", "once"),
         ("fps", "can't be read; write v4l2:/dev/video0.width=1280"),
         ("fps=30&", "can't be read"),
     ],
 )
-def test_what_can_not_be_asked_for_is_refused_in_words(query: str, words: str) -> None:
-    """With what there may be, before anything is opened."""
+def test_unavailable_stream_is_refused_with_the_reason(query: str, words: str) -> None:
+    """The error has the valid values; the device is not opened."""
     with pytest.raises(Invalid, match=words):
         read_device(f"v4l2:/dev/video0?{query}")

@@ -1,4 +1,4 @@
-"""The camera process under a real daemon: a simulated ROS camera, a relay that takes its pictures."""
+"""The camera process under a real daemon: a simulated ROS camera, and a relay that receives its frames."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ import pytest
 import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
-from switchboard_processes import mortal
-from switchboard_rtsp import RtspCamera, card
 
 from relay_protocol import frames, link
 from robot_client.platforms.ros2.transport import without_shared_memory
-from tests.robot_client.fake_relay import PATIENCE, FakeRelay, Peer
 from tests.robot_client.robot_process import Robot, until
+from tests.worlds.fake_relay import PATIENCE, FakeRelay, Peer
+from tests.worlds.processes import mortal
+from tests.worlds.rtsp_camera import RtspCamera, card
 
 RAW = "/camera/image_raw"
 COMPRESSED = "/camera/image_raw/compressed"
@@ -35,7 +35,7 @@ SIZE = (640, 480)
 
 @pytest.fixture(scope="module")
 def camera(environment: dict[str, str]) -> Iterator[None]:
-    """A simulated robot that publishes pictures while somebody wants them."""
+    """A simulated robot that publishes images while it has subscribers."""
     command = mortal([sys.executable, "-m", "robot_client.sim.main", "--camera", "--seed", "1"])
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -53,14 +53,14 @@ class Scene:
         self.relay = relay
         self.robot = robot
         self.process = robot.run(*options)
-        # A busy machine may keep a process from its processor for seconds.
+        # A busy machine may delay a process for seconds.
         self.control = relay.register(heartbeat=5.0)
 
     def cameras(self) -> list[psutil.Process]:
         return self.robot.children(self.process, PROCESS)
 
     def until_listed(self, name: str, **like: object) -> link.Camera:
-        """The camera, once the robot has told of it so."""
+        """The camera, once the robot has reported these values."""
         while True:
             for each in self.control.expect(link.Cameras).cameras:
                 if each.name == name and all(getattr(each, key) == value for key, value in like.items()):
@@ -98,13 +98,13 @@ def picture(peer: Peer) -> tuple[frames.VideoFrame, npt.NDArray[np.uint8]]:
 
 
 def test_real_camera_is_shown_and_ends_with_its_stream(scene: Scene) -> None:
-    """JPEG of the camera's size comes, counted from 1 and stamped with the wall clock, `playing` before it; none comes
-    2 s after `close_video`, and the camera is known with size and rate.
+    """JPEG in the camera's size, counted from 1 and stamped with the wall clock, after `stream_status`; no
+    frame follows 2 s after `close_video`, and the camera's size and rate are known.
     """
     assert scene.cameras() == []
     peer = scene.video(RAW)
     first, shown = picture(peer)
-    (playing,) = [each for each in peer.skipped if isinstance(each, link.Playing)]
+    (playing,) = [each for each in peer.skipped if isinstance(each, link.StreamStatus)]
     assert (playing.width, playing.height, playing.quality, playing.reduced) == (*SIZE, 80, 0)
     assert first.number == 1
     assert abs(first.stamp / 1e9 - time.time()) < 5
@@ -115,13 +115,13 @@ def test_real_camera_is_shown_and_ends_with_its_stream(scene: Scene) -> None:
         assert picture(peer)[0].number == number
     seen = scene.until_listed(RAW, encoding="rgb8", width=SIZE[0], height=SIZE[1])
     assert seen.type == "sensor_msgs/msg/Image"
-    scene.control.say(link.CloseVideo(stream="s1"))
+    scene.control.send(link.CloseVideo(stream="s1"))
     peer.expect(link.Bye)
     peer.expect_end()
 
 
 def test_settings_are_followed_and_cameras_shared(scene: Scene) -> None:
-    """Two streams of one camera, one of them smaller, turned and slower, come from one process side by side."""
+    """Two streams of one camera, one of them smaller, rotated and slower, come from one process."""
     whole = scene.video(RAW)
     small = scene.video(RAW, link.VideoSettings(width=160, rotate=90, fps=4, quality=50), "s2")
     assert picture(whole)[1].shape == (480, 640, 3)
@@ -134,7 +134,7 @@ def test_settings_are_followed_and_cameras_shared(scene: Scene) -> None:
 
 
 def test_inhibited_camera_shows_nothing_for_its_time(scene: Scene) -> None:
-    """Its pictures are samples of its topic too; another form of it goes on, and so does it afterwards."""
+    """Its images are samples of its topic too; another transport continues, and so does this one afterwards."""
     peer, other = scene.video(RAW), scene.video(COMPRESSED, stream="s2")
     picture(peer)
     picture(other)
@@ -146,11 +146,11 @@ def test_inhibited_camera_shows_nothing_for_its_time(scene: Scene) -> None:
     assert after >= begun + 1.4
     while picture(other)[0].stamp / 1e9 < quiet:
         pass
-    assert not [each for each in other.skipped if isinstance(each, link.NotPlaying)]
+    assert not [each for each in other.skipped if isinstance(each, link.StreamRefused)]
 
 
 def test_jpeg_of_the_camera_itself_passes_untouched(scene: Scene) -> None:
-    """A CompressedImage nobody wants edited goes out as it came, also where a better quality was asked for."""
+    """A CompressedImage without edits is sent unchanged, even if a higher quality was requested."""
     asked = scene.video(COMPRESSED, link.VideoSettings(quality=100))
     frame, shown = picture(asked)
     assert shown.shape == (480, 640, 3)
@@ -161,7 +161,7 @@ def test_jpeg_of_the_camera_itself_passes_untouched(scene: Scene) -> None:
 
 @pytest.fixture
 def once(environment: dict[str, str]) -> Iterator[str]:
-    """A topic on which one picture was published, before anybody listened."""
+    """A topic on which one image was published before any subscription."""
     context = rclpy.Context()
     with without_shared_memory(rclpy.get_rmw_implementation_identifier()):
         rclpy.init(context=context)
@@ -174,21 +174,21 @@ def once(environment: dict[str, str]) -> Iterator[str]:
     rclpy.shutdown(context=context)
 
 
-def test_picture_that_was_published_once_is_shown_to_all_who_come(
+def test_frame_that_was_published_once_is_shown_to_all_viewers(
     relay: FakeRelay, robot: Robot, once: str
 ) -> None:
-    """To the first, to who wants it otherwise beside him, and to who comes when nobody has watched for a while."""
+    """To the first, to a concurrent one with another format, and to a later one after a time without viewers."""
     scene = Scene(relay, robot)
     scene.until_listed(once)
     first = scene.video(once)
     number, shown = picture(first)
     assert (number.number, shown.shape) == (1, (48, 64, 3))
     assert abs(int(shown[5, 5, 0]) - 90) < 3
-    (playing,) = [each for each in first.skipped if isinstance(each, link.Playing)]
+    (playing,) = [each for each in first.skipped if isinstance(each, link.StreamStatus)]
     assert playing.latched
     assert picture(scene.video(once, link.VideoSettings(width=32), "s2"))[1].shape == (24, 32, 3)
-    scene.control.say(link.CloseVideo(stream="s1"))
-    scene.control.say(link.CloseVideo(stream="s2"))
+    scene.control.send(link.CloseVideo(stream="s1"))
+    scene.control.send(link.CloseVideo(stream="s2"))
     first.expect_end()
     again, _ = picture(scene.video(once, link.VideoSettings(quality=50), "s3"))
     assert again.number == 1
@@ -209,31 +209,31 @@ def wild(environment: dict[str, str]) -> Iterator[Any]:
 def test_bad_spell_of_a_camera_and_its_changes_end_no_stream(
     relay: FakeRelay, robot: Robot, wild: Any
 ) -> None:
-    """Pictures that are too short, of an encoding nobody knows, and then of another size and encoding than before."""
+    """Images that are too short, of an unknown encoding, and then of another size and encoding."""
     scene = Scene(relay, robot)
     scene.until_listed("/wild")
     peer = scene.video("/wild")
 
     def until_seen(high: int, wide: int, **image: Any) -> int:
-        """Publish it until it is shown; the picture's number."""
+        """Publishes it until it is shown; returns the frame's number."""
         with publishing(wild, height=high, width=wide, **image):
             while True:
                 frame, shown = picture(peer)
                 if shown.shape == (high, wide, 3):
                     return frame.number
 
-    def until_told(words: str, **image: Any) -> None:
+    def until_reported(words: str, **image: Any) -> None:
         with publishing(wild, height=48, width=64, **image):
-            while words not in peer.expect(link.Playing).trouble:
+            while words not in peer.expect(link.StreamStatus).problem:
                 pass
 
     until_seen(48, 64, step=64, encoding="mono8", data=bytes(64 * 48))
-    until_told("there are 9", step=64, encoding="mono8", data=bytes(9))
-    until_told("'odd' can't be shown", step=64, encoding="odd", data=bytes(64 * 48))
+    until_reported("the message has 9", step=64, encoding="mono8", data=bytes(9))
+    until_reported("'odd' can't be shown", step=64, encoding="odd", data=bytes(64 * 48))
     last = until_seen(24, 32, step=96, encoding="rgb8", data=bytes(96 * 24))
     assert until_seen(96, 128, step=128, encoding="nv12", data=bytes([128]) * (128 * 144)) > last
-    assert not [each for each in peer.skipped if isinstance(each, link.NotPlaying)]
-    assert [each for each in peer.skipped if isinstance(each, link.Playing)][-1].trouble == ""
+    assert not [each for each in peer.skipped if isinstance(each, link.StreamRefused)]
+    assert [each for each in peer.skipped if isinstance(each, link.StreamStatus)][-1].problem == ""
 
 
 @contextmanager
@@ -254,21 +254,21 @@ def publishing(publisher: Any, **image: Any) -> Iterator[None]:
         thread.join()
 
 
-def test_what_can_not_be_shown_is_said_on_the_link(scene: Scene) -> None:
-    """A camera that does not exist, and a crop outside of the picture, are refused in words, and the link ends."""
+def test_undecodable_frame_is_reported_on_the_link(scene: Scene) -> None:
+    """A missing camera, and a crop outside the image, are refused with a reason, and the link ends."""
     for camera, settings, words in (
         ("/no/camera", link.VideoSettings(), "no camera /no/camera"),
         (RAW, link.VideoSettings(crop=(9, 8000, 10, 10)), "8000"),
     ):
         peer = scene.video(camera, settings)
-        refused = peer.expect(link.NotPlaying)
+        refused = peer.expect(link.StreamRefused)
         assert words in refused.reason
         assert not refused.busy
         peer.expect_end()
 
 
 def test_killed_process_comes_back(scene: Scene) -> None:
-    """After kill -9 the links end, and the next stream is shown by another process."""
+    """After kill -9 the links end, and the next stream uses another process."""
     peer = scene.video(RAW)
     picture(peer)
     (process,) = scene.cameras()
@@ -280,7 +280,7 @@ def test_killed_process_comes_back(scene: Scene) -> None:
 
 
 def test_lost_control_link_ends_the_streams(scene: Scene) -> None:
-    """A robot that is not registered shows nothing; registered again it tells its cameras anew."""
+    """An unregistered robot sends no frames; registered again it reports its cameras again."""
     peer = scene.video(RAW)
     picture(peer)
     scene.control.cut()
@@ -292,7 +292,7 @@ def test_lost_control_link_ends_the_streams(scene: Scene) -> None:
 
 @pytest.mark.parametrize("how", ["terminate", "kill"])
 def test_process_ends_with_its_daemon(scene: Scene, how: str) -> None:
-    """Whether the daemon leaves in order or is killed."""
+    """Whether the daemon exits or is killed."""
     picture(scene.video(RAW))
     (process,) = scene.cameras()
     getattr(scene.process, how)()
@@ -303,29 +303,29 @@ def test_process_ends_with_its_daemon(scene: Scene, how: str) -> None:
 def test_camera_without_ros_and_the_limit_of_streams(
     relay: FakeRelay, robot: Robot, tmp_path: Path, environment: dict[str, str]
 ) -> None:
-    """A file is shown as a camera, over and over; one stream more than the settings allow is told to be too many."""
+    """A file is shown repeatedly as a camera; a stream over the limit of the settings is refused as too many."""
     film = tmp_path / "film.avi"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
     for grey in range(5):
         writer.write(np.full((48, 64, 3), 40 * grey, np.uint8))
     writer.release()
     config = tmp_path / "robot.toml"
-    config.write_text(f'[cameras]\n"/film" = "{film}"\n[video]\nstreams = 1\n')
+    config.write_text(f'[cameras]\n"/film" = "{film}"\n[video]\nmax_streams = 1\n')
     scene = Scene(relay, robot, "--config", str(config))
     assert scene.until_listed("/film").type == ""
     peer = scene.video("/film")
     for _ in range(12):
         assert picture(peer)[1].shape == (48, 64, 3)
-    refused = scene.video("/film", stream="s2").expect(link.NotPlaying)
+    refused = scene.video("/film", stream="s2").expect(link.StreamRefused)
     assert refused.busy
-    scene.control.say(link.CloseVideo(stream="s1"))
+    scene.control.send(link.CloseVideo(stream="s1"))
     peer.expect_end()
     assert picture(scene.video("/film", stream="s3"))[0].number == 1
 
 
 @pytest.fixture
 def network(relay: FakeRelay, robot: Robot, tmp_path: Path) -> Iterator[tuple[Scene, RtspCamera]]:
-    """A daemon whose settings name a camera of the network."""
+    """A daemon with a network camera in its settings."""
     with closing(RtspCamera(login="ann:s3cret")) as camera:
         config = tmp_path / "robot.toml"
         config.write_text(f'[cameras]\n"/gate" = "{camera.url}"\n')
@@ -335,7 +335,9 @@ def network(relay: FakeRelay, robot: Robot, tmp_path: Path) -> Iterator[tuple[Sc
 
 
 def test_camera_of_the_network_has_one_connection(network: tuple[Scene, RtspCamera]) -> None:
-    """However many streams there are, of whatever quality of service, which is ROS's; it shows what is before it."""
+    """For any number of streams and any quality of service, which is a matter of ROS; it shows the camera's
+    view.
+    """
     scene, camera = network
     one = scene.video("/gate")
     other = scene.video("/gate", link.VideoSettings(width=80, qos="default"), "s2")
@@ -346,9 +348,9 @@ def test_camera_of_the_network_has_one_connection(network: tuple[Scene, RtspCame
     assert np.abs(square - card(0)[20, 20]).max() < 20
 
 
-def test_silent_camera_holds_up_nobody(network: tuple[Scene, RtspCamera], robot: Robot) -> None:
-    """While it is waited for its stream is closed in time, and so are process and daemon. Nor does any process or log
-    show its password.
+def test_silent_camera_delays_no_other(network: tuple[Scene, RtspCamera], robot: Robot) -> None:
+    """While it is awaited, its stream closes in time, and so do process and daemon. No process list or log
+    has its password.
     """
     scene, camera = network
     peer = scene.video("/gate")
@@ -356,7 +358,7 @@ def test_silent_camera_holds_up_nobody(network: tuple[Scene, RtspCamera], robot:
     (process,) = scene.cameras()
     shown = [*process.cmdline(), *process.environ().values(), *psutil.Process(scene.process.pid).cmdline()]
     camera.stall()
-    scene.control.say(link.CloseVideo(stream="s1"))
+    scene.control.send(link.CloseVideo(stream="s1"))
     peer.expect(link.Bye)
     peer.expect_end()
     scene.process.terminate()

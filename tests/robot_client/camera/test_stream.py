@@ -1,4 +1,4 @@
-"""One stream in memory: a link without a socket, a camera without pictures, threads that the test is."""
+"""One stream in memory: a link without a socket, a camera without images, and threads simulated by the test."""
 
 from __future__ import annotations
 
@@ -15,12 +15,18 @@ from twisted.logger import capturedLogs
 from relay_protocol import frames, link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from robot_client.camera.frame import Encoded, EncodeRequest, Frame, FrameFormat
+from robot_client.camera.images import DamagedImage
 from robot_client.camera.ipc import OpenStream
-from robot_client.camera.messages import Damaged
 from robot_client.camera.packetizer import PART
-from robot_client.camera.rtt_probe import DOUBT, RttProbe
-from robot_client.camera.stream import BEARS, FAULTS, TELL_EVERY, Busy, EncodedStream
-from robot_client.link.protocol import VideoLink
+from robot_client.camera.rate_control import PROBE_AFTER, RttProbe
+from robot_client.camera.stream import (
+    DAMAGED_SECONDS,
+    MAX_FAULTS,
+    REPORT_INTERVAL,
+    EncodedStream,
+    StreamLimitReached,
+)
+from robot_client.link.links import VideoLink
 from robot_client.link.transport import LinkProtocol
 
 QUIET = ("join", "ping", "pong")
@@ -31,18 +37,18 @@ def unread() -> Any:
 
 
 class View:
-    """The camera as the stream has it; pictures are made when the test says so."""
+    """The stream's view of the camera; the test completes encodings."""
 
     def __init__(self) -> None:
         self.fps = 15.0
         self.latched = False
         self.closed = 0
         self.before: Frame | None = None
-        self.wishes: list[EncodeRequest] = []
+        self.requests: list[EncodeRequest] = []
         self.making: list[tuple[Frame, Deferred[Encoded]]] = []
 
-    def make(self, shot: Frame, wish: EncodeRequest) -> Deferred[Encoded]:
-        self.wishes.append(wish)
+    def encode(self, shot: Frame, request: EncodeRequest) -> Deferred[Encoded]:
+        self.requests.append(request)
         done: Deferred[Encoded] = Deferred()
         self.making.append((shot, done))
         return done
@@ -73,43 +79,43 @@ class Scene:
         self.protocol = LinkProtocol(
             VideoLink("t", self.now, 2.0),
             lambda protocol: EncodedStream(
-                line, protocol, self.watch, self.clock, lambda _, why: self.gone.append(why), self.way
+                line, protocol, self.open_view, self.clock, lambda _, why: self.gone.append(why), self.way
             ),
             self.clock,
         )
         self.stream: Any = self.protocol.owner
         self.transport = StringTransportWithDisconnection()
         self.transport.protocol = self.protocol
-        self.transport.abortConnection = self.transport.loseConnection  # as a real one ends, for this test
+        self.transport.abortConnection = self.transport.loseConnection  # for this test, as a real one ends
         self.protocol.makeConnection(self.transport)
 
     def now(self) -> int:
         return round(self.clock.seconds() * 1e9)
 
-    def watch(self, line: OpenStream, on_shot: Callable[[Frame], None]) -> View:
+    def open_view(self, line: OpenStream, on_shot: Callable[[Frame], None]) -> View:
         if self._refusal is not None:
             raise self._refusal
         self.shoot: Callable[[Frame], None] = on_shot
         return self.view
 
-    def say(self, message: link.Message) -> None:
+    def send(self, message: link.Message) -> None:
         self.protocol.dataReceived(link.frame(message))
 
     def joined(self) -> Scene:
-        self.say(link.Joined(channel="s", at=1))
+        self.send(link.Joined(channel="s", at=1))
         for _ in range(3):
-            self.say(link.Pong(t=self.now(), at=2))
+            self.send(link.Pong(t=self.now(), at=2))
         return self
 
     def shot(self, stamp: int) -> None:
         self.shoot(Frame(stamp, self.clock.seconds(), lambda: FrameFormat("rgb8", 64, 48), unread))
 
-    def make(self, size: int = 1000, width: int = 64) -> None:
-        """End the making of the latest picture."""
+    def encode(self, size: int = 1000, width: int = 64) -> None:
+        """Completes the latest encoding."""
         self.view.making[-1][1].callback(Encoded(bytes(size), width, 48, "rgb8"))
 
     def heard(self) -> list[Any]:
-        """What went to the relay, pictures, and messages as dicts, but for pings and the opening."""
+        """Frames and messages (as dicts) sent to the relay, except pings and the handshake."""
         data = self.transport.value()
         self.transport.clear()
         found = [
@@ -119,20 +125,20 @@ class Scene:
         return [each for each in found if not isinstance(each, dict) or each["op"] not in QUIET]
 
     def pictures(self) -> list[int]:
-        """Stamps of the pictures that went."""
+        """Stamps of the sent frames."""
         return [each.stamp for each in self.heard() if isinstance(each, frames.VideoFrame)]
 
 
-def test_playing_is_said_before_the_first_picture() -> None:
-    """Then the picture, numbered from 1, with the stamp of its arrival."""
+def test_playing_is_sent_before_the_first_frame() -> None:
+    """Then the frame, numbered from 1, with the stamp of its arrival."""
     scene = Scene().joined()
     scene.heard()
     scene.shot(7)
-    scene.make(10)
+    scene.encode(10)
     playing, picture = scene.heard()
     assert playing.pop("reduced", 0) == 0
     assert playing == {
-        "op": "playing",
+        "op": "stream_status",
         "width": 64,
         "height": 48,
         "quality": 80,
@@ -142,131 +148,134 @@ def test_playing_is_said_before_the_first_picture() -> None:
     assert picture == frames.VideoFrame(1, 7, bytes(10))
 
 
-def test_newest_picture_wins() -> None:
-    """While one is being made and while two are under way only the newest waits; it goes when the relay took one."""
+def test_newest_frame_wins() -> None:
+    """While one is being encoded and two are under way, only the newest waits; it is sent at the next answer."""
     scene = Scene().joined()
     scene.shot(1)
     scene.shot(2)
     scene.shot(3)
-    scene.make()
+    scene.encode()
     assert scene.pictures() == [1]
     scene.shot(4)
-    assert len(scene.view.making) == 1  # the first shows what the link is like
+    assert len(scene.view.making) == 1  # the first one measures the link
     scene.clock.advance(0.01)
-    scene.say(link.Took(number=1))
+    scene.send(link.FrameAck(number=1))
     assert [shot.stamp for shot, _ in scene.view.making] == [1, 4]
-    scene.make()
+    scene.encode()
     scene.shot(5)
-    scene.make()
+    scene.encode()
     scene.shot(6)
     assert scene.pictures() == [4, 5]
     assert len(scene.view.making) == 3
 
 
-def test_first_picture_and_the_one_asked_for_stand_alone() -> None:
-    """A key frame is wished at the start, and once when somebody joined."""
+def test_first_frame_and_a_requested_one_are_key_frames() -> None:
+    """A key frame is requested at the start, and once when a viewer joined."""
     scene = Scene(codec="h264").joined()
     for number in range(1, 5):
         if number == 3:
-            scene.say(link.KeyFrame())
+            scene.send(link.RequestKeyFrame())
         scene.shot(number)
-        scene.make()
+        scene.encode()
         scene.clock.advance(0.05)
-        scene.say(link.Took(number=number))
-    assert [wish.key for wish in scene.view.wishes] == [True, False, True, False]
+        scene.send(link.FrameAck(number=number))
+    assert [request.key for request in scene.view.requests] == [True, False, True, False]
 
 
-def test_thin_uplink_makes_less_and_says_so() -> None:
-    """After a picture that took seconds the next is wished smaller, and `playing` says how much."""
+def test_thin_uplink_makes_less_and_reports_it() -> None:
+    """After a frame that took seconds, a smaller one is requested, and `stream_status` has the reduction."""
     scene = Scene().joined()
     scene.shot(1)
-    scene.make(15_000)
+    scene.encode(15_000)
     scene.heard()
     scene.clock.advance(2.0)
-    scene.say(link.Took(number=1))
+    scene.send(link.FrameAck(number=1))
     scene.shot(2)
-    wish = scene.view.wishes[-1]
-    assert wish.reduced
-    assert wish.quality < 80
-    assert wish.scale < 1
-    scene.make(2_000, width=16)
+    request = scene.view.requests[-1]
+    assert request.reduced
+    assert request.quality < 80
+    assert request.scale < 1
+    scene.encode(2_000, width=16)
     playing = scene.heard()[0]
     assert playing["width"] == 16
     assert 0 < playing["reduced"] <= 1
     assert playing["delay_ms"] == 2000
 
 
-def test_after_a_picture_that_was_given_up_one_stands_alone() -> None:
-    """What the relay has of it is nothing to go on from."""
+def test_after_a_frame_that_was_discarded_one_is_a_key_frame() -> None:
+    """The part that the relay has is no reference."""
     scene = Scene(codec="h264").joined()
     scene.shot(1)
-    scene.make(200_000)
+    scene.encode(200_000)
     parts = scene.heard()[1:]
     assert [each.offset for each in parts] == [0, PART, 2 * PART]
     for part in parts:
         scene.shot(2)
         assert len(scene.view.making) == 1
         scene.clock.advance(1.0)
-        scene.say(link.Took(number=1, upto=part.offset + PART))
+        scene.send(link.FrameAck(number=1, received=part.offset + PART))
     assert scene.heard() == []
-    assert [wish.key for wish in scene.view.wishes] == [True, True]
-    assert scene.view.wishes[-1].scale < 1
+    assert [request.key for request in scene.view.requests] == [True, True]
+    assert scene.view.requests[-1].scale < 1
 
 
 @pytest.mark.parametrize("codec", ["h264", "jpeg"])
-def test_one_that_was_being_made_when_it_was_given_up_does_not_go_on_from_it(codec: str) -> None:
-    """Of H.264; it is made again, so as to stand alone, if no newer one is there."""
+def test_frame_in_the_encoder_does_not_continue_a_discarded_one(codec: str) -> None:
+    """In H.264 it is encoded again as a key frame, if there is no newer one."""
     scene = Scene(codec=codec).joined()
     scene.shot(1)
-    scene.make(40_000)
+    scene.encode(40_000)
     for part in scene.heard()[1:]:
         scene.clock.advance(0.001)
-        scene.say(link.Took(number=1, upto=part.offset + PART if part.offset + PART < 40_000 else None))
+        scene.send(
+            link.FrameAck(number=1, received=part.offset + PART if part.offset + PART < 40_000 else None)
+        )
     scene.shot(2)
-    scene.make(200_000)
+    scene.encode(200_000)
     scene.shot(3)
     assert [shot.stamp for shot, _ in scene.view.making] == [1, 2, 3]
     while parts := scene.heard():
         for part in parts:
             scene.clock.advance(1.0)
-            scene.say(link.Took(number=2, upto=part.offset + PART))
-    scene.make(1000)
+            scene.send(link.FrameAck(number=2, received=part.offset + PART))
+    scene.encode(1000)
     if codec == "jpeg":
         assert scene.pictures() == [3]
         return
     assert scene.pictures() == []
     assert [
-        (shot.stamp, wish.key) for (shot, _), wish in zip(scene.view.making, scene.view.wishes, strict=True)
+        (shot.stamp, request.key)
+        for (shot, _), request in zip(scene.view.making, scene.view.requests, strict=True)
     ] == [(1, True), (2, False), (3, False), (3, True)]
-    scene.make(1000)
+    scene.encode(1000)
     (picture,) = [each for each in scene.heard() if isinstance(each, frames.VideoFrame)]
     assert (picture.number, picture.stamp) == (3, 3)
     scene.clock.advance(0.01)
-    scene.say(link.Took(number=3))
+    scene.send(link.FrameAck(number=3))
     scene.shot(4)
     scene.clock.advance(1.0)
-    scene.make(1000)
+    scene.encode(1000)
     assert scene.pictures() == [4]
-    assert not scene.view.wishes[-1].key
+    assert not scene.view.requests[-1].key
 
 
 @pytest.mark.parametrize(("latched", "made"), [(True, [1, 1]), (False, [1])])
-def test_kept_picture_that_was_given_up_is_made_again(latched: bool, made: list[int]) -> None:
-    """Smaller, because no other one may follow; of other cameras the next one does."""
+def test_latched_frame_that_was_discarded_is_encoded_again(latched: bool, made: list[int]) -> None:
+    """Smaller, because no other one may follow; other cameras send the next one."""
     scene = Scene().joined()
     scene.view.latched = latched
     scene.shot(1)
     scene.view.before = scene.view.making[-1][0]
-    scene.make(200_000)
+    scene.encode(200_000)
     for part in scene.heard()[1:]:
         scene.clock.advance(1.0)
-        scene.say(link.Took(number=1, upto=part.offset + PART))
+        scene.send(link.FrameAck(number=1, received=part.offset + PART))
     assert [shot.stamp for shot, _ in scene.view.making] == made
-    assert (scene.view.wishes[-1].scale < 1) == latched
+    assert (scene.view.requests[-1].scale < 1) == latched
 
 
 @pytest.mark.parametrize(("latched", "made"), [(True, [(1, True), (1, True)]), (False, [(1, True)])])
-def test_kept_picture_is_made_again_for_who_needs_one_that_stands_alone(
+def test_latched_frame_is_encoded_again_for_a_viewer_that_needs_one_that_is_a_key_frame(
     latched: bool, made: list[tuple[int, bool]]
 ) -> None:
     """In H.264, at once, because no other one may follow."""
@@ -274,57 +283,57 @@ def test_kept_picture_is_made_again_for_who_needs_one_that_stands_alone(
     scene.view.latched = latched
     scene.shot(1)
     scene.view.before = scene.view.making[-1][0]
-    scene.make()
+    scene.encode()
     scene.clock.advance(0.01)
-    scene.say(link.Took(number=1))
-    scene.say(link.KeyFrame())
-    wished = zip(scene.view.making, scene.view.wishes, strict=True)
-    assert [(shot.stamp, wish.key) for (shot, _), wish in wished] == made
+    scene.send(link.FrameAck(number=1))
+    scene.send(link.RequestKeyFrame())
+    encoded = zip(scene.view.making, scene.view.requests, strict=True)
+    assert [(shot.stamp, request.key) for (shot, _), request in encoded] == made
 
 
-def test_measured_delay_is_told_once_a_second_at_most() -> None:
-    """What was decided is told at once, what is measured now and then."""
+def test_measured_delay_is_reported_once_a_second_at_most() -> None:
+    """Decisions are reported at once, measurements at intervals."""
     scene = Scene().joined()
-    told = 0
+    reported = 0
     for number in range(1, 41):
         scene.shot(number)
-        scene.make()
+        scene.encode()
         scene.clock.advance(0.05 + 0.001 * number)
-        scene.say(link.Took(number=number))
-        told += sum(isinstance(each, dict) and each["op"] == "playing" for each in scene.heard())
-    assert 2 <= told <= 2 + (scene.clock.seconds() - 100) / TELL_EVERY
+        scene.send(link.FrameAck(number=number))
+        reported += sum(isinstance(each, dict) and each["op"] == "stream_status" for each in scene.heard())
+    assert 2 <= reported <= 2 + (scene.clock.seconds() - 100) / REPORT_INTERVAL
 
 
-def test_whether_a_picture_is_kept_is_told_with_it_and_when_it_changes() -> None:
-    """Also if no other picture comes: who subscribes to a topic learns only then how it is published."""
+def test_whether_a_frame_is_latched_is_reported_with_it_and_when_it_changes() -> None:
+    """Even without another frame: a new subscriber learns the publisher's QoS only then."""
     scene = Scene().joined()
     scene.heard()
-    scene.clock.advance(TELL_EVERY)
-    assert scene.heard() == []  # nothing is told before there is a picture
+    scene.clock.advance(REPORT_INTERVAL)
+    assert scene.heard() == []  # there is no report before the first frame
     scene.view.latched = True
     scene.shot(1)
-    scene.make()
+    scene.encode()
     assert scene.heard()[0]["latched"]
-    scene.clock.advance(TELL_EVERY)
-    scene.say(link.Took(number=1))
+    scene.clock.advance(REPORT_INTERVAL)
+    scene.send(link.FrameAck(number=1))
     assert scene.heard() == []
     scene.view.latched = False
-    scene.clock.advance(TELL_EVERY)
+    scene.clock.advance(REPORT_INTERVAL)
     (playing,) = scene.heard()
-    assert (playing["op"], playing["width"], playing.get("latched", False)) == ("playing", 64, False)
+    assert (playing["op"], playing["width"], playing.get("latched", False)) == ("stream_status", 64, False)
     scene.stream.close("over")
     scene.view.latched = True
-    scene.clock.advance(TELL_EVERY)
+    scene.clock.advance(REPORT_INTERVAL)
     assert [each["op"] for each in scene.heard()] == ["bye"]
 
 
-def test_rate_is_kept_and_the_last_picture_still_goes() -> None:
-    """A picture that came too early for the rate goes when its time has come, also if no other follows."""
+def test_rate_is_kept_and_the_last_frame_still_goes() -> None:
+    """A frame that was too early for the rate is sent when it is due, even without another."""
     scene = Scene(fps=2).joined()
     scene.shot(1)
-    scene.make()
+    scene.encode()
     scene.clock.advance(0.05)
-    scene.say(link.Took(number=1))
+    scene.send(link.FrameAck(number=1))
     scene.shot(2)
     assert len(scene.view.making) == 1
     scene.clock.advance(0.5)
@@ -332,229 +341,249 @@ def test_rate_is_kept_and_the_last_picture_still_goes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "busy"), [(NotFound("no such camera"), False), (Busy("too many streams"), True)]
+    ("error", "busy"), [(NotFound("no such camera"), False), (StreamLimitReached("too many streams"), True)]
 )
-def test_camera_that_can_not_be_had_is_refused_in_words(error: SwitchboardError, busy: bool) -> None:
-    """And the link ends."""
+def test_camera_that_can_not_be_opened_is_refused_with_the_reason(
+    error: SwitchboardError, busy: bool
+) -> None:
+    """The link ends."""
     scene = Scene(error).joined()
     (said,) = scene.heard()
-    assert (said["op"], said["reason"], said.get("busy", False)) == ("not_playing", str(error), busy)
+    assert (said["op"], said["reason"], said.get("busy", False)) == ("stream_refused", str(error), busy)
     assert not scene.transport.connected
     assert scene.gone == [str(error)]
 
 
-def test_first_picture_that_can_not_be_made_ends_the_stream() -> None:
-    """With what is wrong with it."""
+def test_first_frame_that_can_not_be_made_ends_the_stream() -> None:
+    """With the reason."""
     scene = Scene().joined()
     scene.heard()
     scene.shot(1)
     scene.view.making[-1][1].errback(Invalid("no such encoding"))
     (said,) = scene.heard()
-    assert (said["op"], said["reason"]) == ("not_playing", "no such encoding")
+    assert (said["op"], said["reason"]) == ("stream_refused", "no such encoding")
     assert scene.view.closed == 1
 
 
 def spoil(scene: Scene, error: Exception) -> None:
-    """Another picture comes, of which nothing can be made."""
+    """Another frame arrives that cannot be encoded."""
     scene.shot(1)
     scene.view.making[-1][1].errback(error)
 
 
-def test_damaged_pictures_at_the_beginning_are_left_out() -> None:
-    """Cameras often begin with some; then it goes on as if nothing had been."""
+def test_damaged_frames_at_the_beginning_are_left_out() -> None:
+    """Cameras often begin with some; then the stream continues normally."""
     scene = Scene().joined()
     scene.heard()
-    for _ in range(FAULTS - 1):
-        spoil(scene, Damaged("the JPEG ends in the middle"))
+    for _ in range(MAX_FAULTS - 1):
+        spoil(scene, DamagedImage("the JPEG is cut off"))
     assert scene.heard() == []
     scene.shot(7)
-    scene.make()
+    scene.encode()
     assert scene.pictures() == [7]
-    assert scene.view.wishes[-1].key
-    for _ in range(round(2 * BEARS / TELL_EVERY)):
-        scene.clock.advance(TELL_EVERY)
-        scene.say(link.Took(number=1))
+    assert scene.view.requests[-1].key
+    for _ in range(round(2 * DAMAGED_SECONDS / REPORT_INTERVAL)):
+        scene.clock.advance(REPORT_INTERVAL)
+        scene.send(link.FrameAck(number=1))
     assert scene.transport.connected
 
 
-def test_stream_of_nothing_but_damaged_pictures_ends_with_what_is_wrong() -> None:
-    """After as many as in between."""
+def test_single_damaged_frames_between_good_ones_are_counted() -> None:
+    scene = Scene().joined()
+    scene.shot(1)
+    scene.encode()
+    scene.heard()
+    for number in (2, 3):
+        scene.send(link.FrameAck(number=number - 1))
+        spoil(scene, DamagedImage("the JPEG is cut off"))
+        scene.shot(number)
+        scene.encode()
+    scene.clock.advance(REPORT_INTERVAL)
+    scene.send(link.FrameAck(number=3))
+    scene.shot(4)
+    scene.encode()
+    said = [each for each in scene.heard() if isinstance(each, dict)]
+    assert {(each["op"], each["damaged"]) for each in said} == {("stream_status", 2)}
+
+
+def test_stream_of_nothing_but_damaged_frames_ends_with_what_is_wrong() -> None:
+    """After the same number as within a stream."""
     scene = Scene().joined()
     scene.heard()
-    for _ in range(FAULTS):
+    for _ in range(MAX_FAULTS):
         assert scene.transport.connected
-        spoil(scene, Damaged("the JPEG ends in the middle"))
+        spoil(scene, DamagedImage("the JPEG is cut off"))
     (said,) = scene.heard()
-    assert (said["op"], said["reason"]) == ("not_playing", "the JPEG ends in the middle")
+    assert (said["op"], said["reason"]) == ("stream_refused", "the JPEG is cut off")
     assert scene.view.closed == 1
 
 
-def test_damaged_picture_after_which_none_comes_is_told() -> None:
-    """A kept one may be all there is: who waits learns why before he is told that nothing came."""
+def test_damaged_frame_after_which_none_comes_is_reported() -> None:
+    """It may be the only one, so the viewer gets this reason before the error that no frame arrived."""
     scene = Scene().joined()
     scene.heard()
-    spoil(scene, Damaged("the PNG is broken"))
-    scene.clock.pump([TELL_EVERY] * round(BEARS / TELL_EVERY - 1))
+    spoil(scene, DamagedImage("the PNG is broken"))
+    scene.clock.pump([REPORT_INTERVAL] * round(DAMAGED_SECONDS / REPORT_INTERVAL - 1))
     assert scene.heard() == []
-    scene.clock.pump([TELL_EVERY] * 2)
+    scene.clock.pump([REPORT_INTERVAL] * 2)
     (said,) = scene.heard()
-    assert (said["op"], said["reason"]) == ("not_playing", "the PNG is broken")
+    assert (said["op"], said["reason"]) == ("stream_refused", "the PNG is broken")
     assert not scene.transport.connected
     assert scene.view.closed == 1
 
 
-def test_what_can_not_be_shown_ends_the_stream_also_behind_a_damaged_picture() -> None:
-    """At once: it would come again."""
+def test_undecodable_frame_ends_the_stream_also_behind_a_damaged_one() -> None:
+    """At once, since it would be repeated."""
     scene = Scene().joined()
     scene.heard()
-    spoil(scene, Damaged("cut off"))
+    spoil(scene, DamagedImage("cut off"))
     spoil(scene, Invalid("no such encoding"))
     assert [each["reason"] for each in scene.heard()] == ["no such encoding"]
 
 
 @pytest.mark.parametrize(
-    "error", [Damaged("cut off"), Invalid("no such encoding"), Unavailable("OpenCV can't")]
+    "error", [DamagedImage("cut off"), Invalid("no such encoding"), Unavailable("OpenCV can't")]
 )
-def test_stream_outlives_any_spell_of_pictures_that_can_not_be_shown(error: SwitchboardError) -> None:
-    """Why none comes is said once that has lasted, and taken back with the first good one."""
+def test_stream_outlives_any_spell_of_frames_that_can_not_be_shown(error: SwitchboardError) -> None:
+    """The reason is reported once after a while, and withdrawn with the first good one."""
     scene = Scene().joined()
     first(scene)
-    for _ in range(30 * FAULTS):
+    for _ in range(30 * MAX_FAULTS):
         spoil(scene, error)
-        scene.clock.advance(TELL_EVERY / 10)
-        scene.say(link.Pong(t=scene.now(), at=2))
+        scene.clock.advance(REPORT_INTERVAL / 10)
+        scene.send(link.Pong(t=scene.now(), at=2))
     (said,) = scene.heard()
-    assert (said["op"], said["trouble"]) == ("playing", str(error))
+    assert (said["op"], said["problem"]) == ("stream_status", str(error))
     scene.shot(3)
-    scene.make(width=32)
+    scene.encode(width=32)
     playing, picture = scene.heard()
-    assert (playing.get("trouble", ""), playing["width"], picture.stamp) == ("", 32, 3)
+    assert (playing.get("problem", ""), playing["width"], picture.stamp) == ("", 32, 3)
     assert scene.transport.connected
 
 
-def test_single_picture_that_can_not_be_shown_is_no_trouble() -> None:
-    """The next one comes before anybody is told."""
+def test_single_frame_that_can_not_be_shown_is_no_trouble() -> None:
+    """The next one arrives before the report."""
     scene = Scene().joined()
     first(scene)
     for stamp in range(2, 40):
-        spoil(scene, Damaged("cut off"))
-        scene.clock.advance(TELL_EVERY / 4)
+        spoil(scene, DamagedImage("cut off"))
+        scene.clock.advance(REPORT_INTERVAL / 4)
         scene.shot(stamp)
-        scene.make()
-        scene.say(link.Took(number=stamp))
-    assert not [each for each in scene.heard() if isinstance(each, dict) and each.get("trouble")]
+        scene.encode()
+        scene.send(link.FrameAck(number=stamp))
+    assert not [each for each in scene.heard() if isinstance(each, dict) and each.get("problem")]
 
 
 def test_encoder_of_h264_that_fails_ends_the_stream() -> None:
-    """Another codec may do, and viewers are told so; a camera's own faults don't end it."""
+    """Another codec may work, which viewers are informed of; errors of a camera do not end it."""
     scene = Scene(codec="h264").joined()
     first(scene)
-    for _ in range(3 * FAULTS):
-        spoil(scene, Damaged("cut off"))
+    for _ in range(3 * MAX_FAULTS):
+        spoil(scene, DamagedImage("cut off"))
     assert scene.transport.connected
     scene.shot(2)
-    scene.make()
-    scene.say(link.Took(number=2))
+    scene.encode()
+    scene.send(link.FrameAck(number=2))
     scene.heard()
-    for _ in range(FAULTS):
+    for _ in range(MAX_FAULTS):
         assert scene.transport.connected
         spoil(scene, Unavailable("this size can't be encoded"))
     assert scene.heard()[-1]["reason"] == "this size can't be encoded"
 
 
-def test_fault_of_ours_in_between_is_logged_once_and_borne() -> None:
-    """What nobody foresaw is for the log, not for viewers."""
+def test_internal_error_in_between_is_logged_once_and_survived() -> None:
+    """Details are for the log, not for viewers."""
     scene = Scene().joined()
     first(scene)
     with capturedLogs() as logs:
         for _ in range(5):
             spoil(scene, ZeroDivisionError("at /home/secret"))
     assert len(logs) == 1
-    scene.clock.advance(2 * TELL_EVERY)
+    scene.clock.advance(2 * REPORT_INTERVAL)
     (said,) = scene.heard()
-    assert "robot's log" in said["trouble"] and "secret" not in said["trouble"]
+    assert "robot's log" in said["problem"] and "secret" not in said["problem"]
     assert scene.transport.connected
 
 
 def first(scene: Scene) -> None:
-    """One picture is shown."""
+    """One frame is shown."""
     scene.shot(1)
-    scene.make()
+    scene.encode()
     scene.clock.advance(0.05)
-    scene.say(link.Took(number=1))
+    scene.send(link.FrameAck(number=1))
     scene.heard()
 
 
-def test_fault_of_ours_ends_the_stream_without_its_text() -> None:
-    """What nobody foresaw is for the log, not for viewers."""
+def test_internal_error_ends_the_stream_without_its_text() -> None:
+    """Details are for the log, not for viewers."""
     scene = Scene().joined()
     scene.heard()
     scene.shot(1)
     scene.view.making[-1][1].errback(ZeroDivisionError("at /home/secret"))
     (said,) = scene.heard()
-    assert said["op"] == "not_playing"
+    assert said["op"] == "stream_refused"
     assert "secret" not in said["reason"]
 
 
-def test_close_says_goodbye_and_lets_the_camera_go() -> None:
-    """What is being made then is not sent."""
+def test_close_sends_bye_and_closes_the_camera() -> None:
+    """A frame being encoded is not sent."""
     scene = Scene().joined()
     scene.shot(1)
     scene.heard()
     scene.stream.close("nobody watches")
-    scene.make()
+    scene.encode()
     assert [each["op"] for each in scene.heard()] == ["bye"]
     assert scene.view.closed == 1
     assert scene.gone == ["nobody watches"]
 
 
-def test_lost_link_lets_the_camera_go() -> None:
-    """And is told once."""
+def test_lost_link_closes_the_camera() -> None:
+    """It is reported once."""
     scene = Scene().joined()
     scene.shot(1)
     scene.transport.loseConnection()
-    scene.make()
+    scene.encode()
     assert scene.view.closed == 1
     assert len(scene.gone) == 1
 
 
 def test_joined_to_another_stream_is_not_believed() -> None:
-    """Pictures of this camera are not for it."""
+    """Frames of this camera do not belong to it."""
     scene = Scene()
-    scene.say(link.Joined(channel="other", at=1))
+    scene.send(link.Joined(channel="other", at=1))
     assert not scene.transport.connected
     assert scene.view.closed == 0
 
 
 def doubted(scene: Scene) -> Scene:
-    """What is measured has been longer than the round trip for so long that it is asked for."""
+    """Measurements have been longer than the round trip for so long that a probe is due."""
     now = scene.clock.seconds()
-    scene.way.measured(0.005, now)
-    scene.way.measured(0.4, now)
-    scene.clock.advance(DOUBT)
+    scene.way.add_measurement(0.005, now)
+    scene.way.add_measurement(0.4, now)
+    scene.clock.advance(PROBE_AFTER)
     return scene
 
 
-def test_round_trip_is_asked_for_by_the_first_byte_of_a_picture() -> None:
-    """The rest leaves when it has its answer, and the relay gets the picture it was."""
+def test_round_trip_is_asked_for_by_the_first_byte_of_a_frame() -> None:
+    """The rest is sent after its answer, and the relay gets the complete frame."""
     scene = doubted(Scene().joined())
     scene.shot(1)
-    scene.make(1000)
+    scene.encode(1000)
     (first,) = scene.heard()[1:]
     assert (first.offset, len(first.body), first.total) == (0, 1, 1000)
     scene.clock.advance(0.35)
-    scene.say(link.Took(number=1, upto=1))
+    scene.send(link.FrameAck(number=1, received=1))
     (rest,) = scene.heard()
-    joiner = frames.PictureJoiner(2**22)
+    joiner = frames.VideoFrameJoiner(2**22)
     assert joiner.join(first) is None
     assert joiner.join(rest) == frames.VideoFrame(1, 1, bytes(1000))
     assert scene.way.seconds == pytest.approx(0.35)
 
 
-def test_picture_that_had_to_wait_for_another_stream_goes_when_that_is_over() -> None:
-    """Also if the camera gives no other one."""
+def test_frame_that_had_to_wait_for_another_stream_goes_when_that_is_over() -> None:
+    """Even if the camera sends no other one."""
     scene = doubted(Scene().joined())
-    scene.way.leaves("another stream", scene.clock.seconds())
+    scene.way.begin("another stream", scene.clock.seconds())
     scene.shot(1)
     scene.clock.advance(0.5)
     assert scene.view.making == []
@@ -564,24 +593,24 @@ def test_picture_that_had_to_wait_for_another_stream_goes_when_that_is_over() ->
 
 
 def test_lost_link_holds_up_no_other_stream() -> None:
-    """What was under way on it is answered no more."""
+    """Frames under way on it get no answer any more."""
     scene = doubted(Scene().joined())
     scene.shot(1)
-    scene.make(1000)
-    assert not scene.way.may_leave(scene.clock.seconds())
+    scene.encode(1000)
+    assert not scene.way.may_send(scene.clock.seconds())
     scene.transport.loseConnection()
-    assert scene.way.may_leave(scene.clock.seconds())
+    assert scene.way.may_send(scene.clock.seconds())
 
 
-def test_stream_begins_with_the_picture_that_was_there() -> None:
-    """With its stamp; its age says nothing of the uplink."""
+def test_stream_begins_with_the_frame_that_was_there() -> None:
+    """With its stamp; its age does not count for the uplink."""
     scene = Scene()
     scene.view.before = Frame(7, scene.clock.seconds() - 15, lambda: FrameFormat("rgb8", 64, 48), unread)
     scene.joined()
-    scene.make()
+    scene.encode()
     assert scene.pictures() == [7]
     scene.clock.advance(0.02)
-    scene.say(link.Took(number=1))
-    assert scene.stream.pace.delay == pytest.approx(0.02)
-    assert scene.stream.pace.reduced == 0
-    assert scene.stream.pace.may_send(scene.clock.seconds())
+    scene.send(link.FrameAck(number=1))
+    assert scene.stream.rate_control.delay == pytest.approx(0.02)
+    assert scene.stream.rate_control.reduced == 0
+    assert scene.stream.rate_control.may_send(scene.clock.seconds())

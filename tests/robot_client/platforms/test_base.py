@@ -1,4 +1,4 @@
-"""Differences between two views of a graph."""
+"""Changes between two views of a graph."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol import link
-from robot_client.platforms.base import GraphView, difference, whole
+from robot_client.platforms.base import GraphView, full_graph, graph_changes
 
 names = st.sampled_from(["/a", "/b", "/c", "/d"])
 topics = st.dictionaries(
@@ -33,17 +33,15 @@ def apply(state: dict[str, dict[str, object]], graph: link.Graph) -> dict[str, d
 
 
 @given(st.lists(views, min_size=1, max_size=6))
-def test_differences_rebuild_the_whole(history: list[GraphView]) -> None:
-    """Who applies every difference to the first whole graph has the last whole graph."""
-    mirror = apply({}, whole(history[0]))
+def test_changes_rebuild_the_last_view(history: list[GraphView]) -> None:
+    mirror = apply({}, full_graph(history[0]))
     for old, new in itertools.pairwise(history):
-        changes = difference(old, new)
+        changes = graph_changes(old, new)
         if changes is not None:
             apply(mirror, changes)
-    assert mirror == apply({}, whole(history[-1]))
+    assert mirror == apply({}, full_graph(history[-1]))
 
 
 @given(views)
-def test_no_change_is_no_message(view: GraphView) -> None:
-    """Two equal views have no difference."""
-    assert difference(view, view) is None
+def test_equal_views_have_no_changes(view: GraphView) -> None:
+    assert graph_changes(view, view) is None

@@ -1,4 +1,4 @@
-"""Type texts with all they contain."""
+"""Definition texts of types, with all types they contain."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ TEXTS = {
 }
 
 
-def test_each_type_comes_once_after_a_rule() -> None:
-    """A text is followed by every type it contains, at any depth, once."""
+def test_contained_types_follow_once_after_a_rule() -> None:
+    """At any depth."""
     parts = full_text("a/msg/Outer", TEXTS.get).split(RULE + "\n")
     assert parts[0] == TEXTS["a/msg/Outer"]
     assert [part.split("\n")[0] for part in parts[1:]] == [
@@ -45,26 +45,22 @@ def test_each_type_comes_once_after_a_rule() -> None:
 
 
 def test_service_has_both_halves() -> None:
-    """A service's text keeps its dividing line, and what both halves contain follows."""
     text = full_text("a/srv/Do", TEXTS.get)
     assert text.startswith("Inner what\n---\nbool ok\n")
     assert "MSG: a/Inner" in text
     assert "MSG: b/Far" in text
 
 
-def test_comments_and_constants_contain_nothing() -> None:
-    """Words in comments and constants are no types."""
+def test_comments_and_constants_contain_no_types() -> None:
     assert contained(TEXTS["a/msg/Deep"], "a", TEXTS.get) == []
 
 
-def test_missing_part_is_named() -> None:
-    """A type that contains one that is not installed says which."""
+def test_missing_contained_type_is_named() -> None:
     with pytest.raises(NotFound, match="b/msg/Far"):
         full_text("a/msg/Outer", {key: text for key, text in TEXTS.items() if key != "b/msg/Far"}.get)
 
 
-def test_endless_definition_is_refused() -> None:
-    """A definition over the limit is not sent."""
+def test_too_large_definition_is_refused() -> None:
     with pytest.raises(Invalid, match="larger"):
         full_text("a/msg/Big", lambda name: "# " + "x" * 300_000)
 
@@ -74,21 +70,19 @@ def test_endless_definition_is_refused() -> None:
     [("std_msgs/String", "std_msgs/msg/String"), ("a/srv/B", "a/srv/B"), ("a/msg/B", "a/msg/B")],
 )
 def test_short_names_are_completed(name: str, full: str) -> None:
-    """A name without its kind means a message."""
     assert normalise(name) == full
 
 
 @pytest.mark.parametrize(
     "name", ["", "String", "../../etc/passwd", "a/msg/../x", "a/msg/b/c", "a/lib/B", "a/msg/B\n"]
 )
-def test_paths_are_no_types(name: str) -> None:
-    """What is no type name never becomes a path."""
+def test_paths_are_refused_as_type_names(name: str) -> None:
     with pytest.raises(Invalid):
         normalise(name)
 
 
 def test_files_and_hashes_are_found_under_share(tmp_path: Path) -> None:
-    """Texts and hashes come from the first prefix that has them."""
+    """In the first prefix that has them."""
     folder = tmp_path / "share" / "a" / "msg"
     folder.mkdir(parents=True)
     (folder / "B.msg").write_text("int8 x\n")
@@ -101,8 +95,8 @@ def test_files_and_hashes_are_found_under_share(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r", "\f", "\x85", "\u2028"])
-def test_lines_end_as_rosidl_has_it(tmp_path: Path, end: str) -> None:
-    """Whatever stands in the file, in the text that is sent a line feed ends each."""
+def test_lines_end_with_a_line_feed(tmp_path: Path, end: str) -> None:
+    """As in rosidl, other line ends count too."""
     folder = tmp_path / "share" / "a" / "msg"
     folder.mkdir(parents=True)
     (folder / "B.msg").write_bytes(f"int8 x # why{end}# more{end}a/C y".encode())
@@ -110,13 +104,11 @@ def test_lines_end_as_rosidl_has_it(tmp_path: Path, end: str) -> None:
 
 
 def test_ament_prefixes_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The robot's own ROS is asked before the Python environment."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/ws/install")
     assert [str(each) for each in prefixes()[:2]] == ["/opt/ros/jazzy", "/ws/install"]
 
 
 def test_action_has_its_three_parts() -> None:
-    """An action's text keeps both dividing lines, and what its parts contain follows."""
     texts = {**TEXTS, "a/action/Go": "Inner to\n---\nb/Far end\n---\nfloat64 left\n"}
     text = full_text("a/action/Go", texts.get)
     assert text.startswith("Inner to\n---\nb/Far end\n---\nfloat64 left\n" + RULE)
@@ -125,7 +117,7 @@ def test_action_has_its_three_parts() -> None:
 
 
 def test_all_names_are_found(tmp_path: Path) -> None:
-    """Types are known by their files and by the resource index, each once, in order; other files are none."""
+    """By files and by the resource index, each once."""
     share = tmp_path / "share"
     for name in ("b/msg/Two.msg", "b/msg/Two.idl", "b/msg/README.md", "a/action/Go.action", "c/cmake/x.srv"):
         (share / name).parent.mkdir(parents=True, exist_ok=True)
@@ -138,7 +130,6 @@ def test_all_names_are_found(tmp_path: Path) -> None:
 
 
 def test_names_fit_into_one_message(tmp_path: Path) -> None:
-    """A robot with more types than one message holds names the first of them."""
     index = tmp_path / "share" / "ament_index" / "resource_index" / "rosidl_interfaces"
     index.mkdir(parents=True)
     (index / "long").write_text("\n".join(f"msg/{'X' * 230}{number:05}.msg" for number in range(6000)))

@@ -11,15 +11,14 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 from twisted.internet import reactor, task
 
-from robot_client.platforms.base import Motion
+from robot_client.platforms.base import CommandEffect
 from robot_client.platforms.ros2.platform import Ros2Platform
-from tests.robot_client.platforms.ends import STAMPED, STRING, Listener, seen
 from tests.robot_client.ros import Peer, until
+from tests.worlds.ros_endpoints import STAMPED, STRING, Listener, seen
 
 
 @pytest_twisted.ensureDeferred
 async def test_samples_are_cdr(ros: Ros2Platform, peer: Peer) -> None:
-    """With either executor a subscription delivers the CDR bytes of the message that was published."""
     topic = f"/raw_{ros._nodes.kind}"
     peer.do("advertise", topic)
     await seen(ros, lambda graph: topic in graph.topics)
@@ -33,23 +32,20 @@ async def test_samples_are_cdr(ros: Ros2Platform, peer: Peer) -> None:
 
 
 def test_zero_is_stamped_now(ros: Ros2Platform) -> None:
-    """The stop of a stamped command has the present in its header."""
-    zero = deserialize_message(ros.zero(STAMPED), TwistStamped)
+    zero = deserialize_message(ros.zero_command(STAMPED), TwistStamped)
     assert abs(zero.header.stamp.sec - time.time()) < 5
-    assert ros.judge(STAMPED, ros.zero(STAMPED)) is Motion.STILL
+    assert ros.classify_command(STAMPED, ros.zero_command(STAMPED)) is CommandEffect.STILL
 
 
 @pytest_twisted.ensureDeferred
-async def test_stuck_executor_is_noticed(ros: Ros2Platform, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An executor that serves no callbacks is told in words; one that does is no trouble."""
+async def test_stuck_executor_is_reported(ros: Ros2Platform, monkeypatch: pytest.MonkeyPatch) -> None:
     await task.deferLater(reactor, 1.2)
-    assert ros.trouble() is None
+    assert ros.fault() is None
     monkeypatch.setattr(ros._nodes.main, "_clock", lambda: time.monotonic() + 60)
-    assert "served nothing" in str(ros.trouble())
+    assert "run no callback" in str(ros.fault())
 
 
 def test_facts_name_the_distribution(ros: Ros2Platform) -> None:
-    """The description names platform and distribution."""
     facts = ros.facts()
     assert facts.platform == "ros2"
     assert facts.distro

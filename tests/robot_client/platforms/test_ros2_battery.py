@@ -7,7 +7,7 @@ import pytest_twisted
 
 from relay_protocol.link import Topic
 from robot_client.platforms.base import GraphView, OnSample
-from robot_client.platforms.ros2.battery import BATTERY, BatteryReader
+from robot_client.platforms.ros2.health import BATTERY, BatteryReader
 from robot_client.platforms.ros2.platform import Ros2Platform
 from robot_client.platforms.ros2.types import Types
 from tests.robot_client.ros import Peer, until
@@ -16,7 +16,6 @@ from tests.robot_client.ros import Peer, until
 @pytest.mark.parametrize("ros", ["events"], indirect=True, scope="module")
 @pytest_twisted.ensureDeferred
 async def test_battery_is_found(ros: Ros2Platform, peer: Peer) -> None:
-    """The first battery topic of the graph gives the charge."""
     assert ros.battery() is None
     peer.do("battery", "/battery_state", 0.75)
     await until(lambda: ros.graph() and ros.battery() is not None)
@@ -24,9 +23,8 @@ async def test_battery_is_found(ros: Ros2Platform, peer: Peer) -> None:
 
 
 def test_malformed_battery_sample_is_no_charge() -> None:
-    """A battery message that is none is passed over."""
     listeners: list[OnSample] = []
     battery = BatteryReader(Types(), lambda topic, on_sample: listeners.append(on_sample))
-    battery.look(GraphView(topics={"/battery": Topic(types=[BATTERY], publishers=["/driver"])}))
+    battery.update(GraphView(topics={"/battery": Topic(types=[BATTERY], publishers=["/driver"])}))
     listeners[0](b"\0\1\0\0\xff")
     assert battery.charge() is None

@@ -14,8 +14,8 @@ from twisted.internet import reactor, task
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from robot_client.platforms.ros2 import service_calls
 from robot_client.platforms.ros2.platform import Ros2Platform
-from tests.robot_client.platforms.ends import seen
 from tests.robot_client.ros import Peer
+from tests.worlds.ros_endpoints import seen
 
 TRIGGER = "std_srvs/srv/Trigger"
 
@@ -32,7 +32,6 @@ async def failure(call: Any) -> SwitchboardError:
 
 @pytest_twisted.ensureDeferred
 async def test_service_is_called(ros: Ros2Platform, peer: Peer) -> None:
-    """A call carries its request there and its answer back."""
     peer.do("serve", "/invert", "invert")
     await seen(ros, lambda graph: "/invert" in graph.services)
     request = bytes(serialize_message(SetBool.Request(data=True)))
@@ -41,8 +40,8 @@ async def test_service_is_called(ros: Ros2Platform, peer: Peer) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_calls_that_can_not_be_answered_end_in_words(ros: Ros2Platform, peer: Peer) -> None:
-    """No such service, another type, senseless arguments, no answer in time: each is told in words, soon."""
+async def test_failed_calls_have_the_reason(ros: Ros2Platform, peer: Peer) -> None:
+    """No such service, another type, invalid arguments, no response in time."""
     peer.do("serve", "/slow", "slow")
     peer.do("serve", "/invert2", "invert")
     await seen(ros, lambda graph: "/slow" in graph.services and "/invert2" in graph.services)
@@ -57,13 +56,13 @@ async def test_calls_that_can_not_be_answered_end_in_words(ros: Ros2Platform, pe
 
 
 @pytest_twisted.ensureDeferred
-async def test_call_is_judged_when_its_service_is_found(
+async def test_check_runs_when_the_service_is_found(
     ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What has happened while it was looked for counts, and nothing is sent of what is refused then."""
+    """A refused request is not sent."""
     peer.do("serve", "/hidden", "invert")
     await seen(ros, lambda graph: "/hidden" in graph.services)
-    before = len(peer.told("inverted", True))
+    before = len(peer.reported("inverted", True))
     found: list[bool] = []
     stopped: list[bool] = []
 
@@ -83,12 +82,12 @@ async def test_call_is_judged_when_its_service_is_found(
     monkeypatch.undo()
     stopped.clear()
     assert await call(False)
-    assert len(peer.told("inverted", True)) == before
+    assert len(peer.reported("inverted", True)) == before
 
 
 @pytest_twisted.ensureDeferred
-async def test_service_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: Peer) -> None:
-    """A call under way to a service that is taken away ends long before its timeout."""
+async def test_call_ends_when_its_service_disappears(ros: Ros2Platform, peer: Peer) -> None:
+    """Long before the timeout."""
     peer.do("serve", "/doomed", "slow")
     await seen(ros, lambda graph: "/doomed" in graph.services)
     call = ros.call("/doomed", TRIGGER, bytes(serialize_message(Trigger.Request())), 600)
@@ -98,18 +97,17 @@ async def test_service_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: 
 
 
 @pytest_twisted.ensureDeferred
-async def test_service_that_is_prepared_need_not_be_found_again(
+async def test_prepared_service_needs_no_discovery(
     ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However long it was not called; that it is waited for makes none."""
-    monkeypatch.setattr(service_calls, "IDLE", -1.0)
+    monkeypatch.setattr(service_calls, "IDLE_SECONDS", -1.0)
     peer.do("serve", "/switch", "invert")
     await seen(ros, lambda graph: "/switch" in graph.services)
     ros.prepare_call("/switch", "std_srvs/srv/SetBool")
     request = bytes(serialize_message(SetBool.Request(data=True)))
     await ros.call("/switch", "std_srvs/srv/SetBool", request, 10)
     ros.graph()
-    monkeypatch.setattr(service_calls, "APPEAR", -1.0)
+    monkeypatch.setattr(service_calls, "DISCOVERY_SECONDS", -1.0)
     assert await ros.call("/switch", "std_srvs/srv/SetBool", request, 10)
     peer.do("unserve", "/switch")
     await seen(ros, lambda graph: "/switch" not in graph.services)

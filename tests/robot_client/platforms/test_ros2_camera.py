@@ -1,4 +1,4 @@
-"""The camera process's node, and publishers of pictures in the same graph."""
+"""The camera process's node, and publishers of images in the same graph."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Scene:
         rclpy.shutdown(context=self.context)
 
     def shown(self, publisher: Any, message: Any) -> bytes:
-        """Publish until it arrives."""
+        """Publish until an image arrives."""
         until = time.monotonic() + PATIENCE
         while time.monotonic() < until:
             publisher.publish(message)
@@ -48,7 +48,7 @@ class Scene:
         raise AssertionError("no picture came")
 
     def offered(self, topic: str) -> Any:
-        """How the one subscription there wants it."""
+        """The quality of service of the only subscription."""
         (found,) = self.node.get_subscriptions_info_by_topic(topic)
         return found.qos_profile
 
@@ -74,45 +74,43 @@ def grey(level: int) -> Image:
         (RELIABLE, "default", True),
     ],
 )
-def test_pictures_come_by_the_quality_of_service_that_fits(
+def test_images_arrive_by_a_matching_quality_of_service(
     scene: Scene, theirs: QoSProfile, asked: str, reliable: bool
 ) -> None:
-    """The publisher's own, or the one asked for by name."""
+    """The publisher's, or a named one."""
     publisher = scene.node.create_publisher(Image, "/grey", theirs)
     scene.cameras.subscribe("/grey", False, asked, scene.got.put)
-    assert formats.image(scene.shown(publisher, grey(7))).pixels.tolist() == [[7, 7], [7, 7]]
+    assert formats.decode_image(scene.shown(publisher, grey(7))).pixels.tolist() == [[7, 7], [7, 7]]
     until = time.monotonic() + PATIENCE
     while (scene.offered("/grey").reliability == ReliabilityPolicy.RELIABLE) != reliable:
         assert time.monotonic() < until
         scene.shown(publisher, grey(7))
 
 
-def test_camera_that_comes_later_is_found_whatever_it_offers(scene: Scene) -> None:
-    """Subscribed before anybody publishes, and published anew with another quality of service."""
+def test_later_publishers_are_matched(scene: Scene) -> None:
+    """Also after a change of their quality of service."""
     scene.cameras.subscribe("/grey", False, "", scene.got.put)
     first = scene.node.create_publisher(Image, "/grey", RELIABLE)
     scene.shown(first, grey(1))
     scene.node.destroy_publisher(first)
     second = scene.node.create_publisher(Image, "/grey", BEST_EFFORT)
     until = time.monotonic() + PATIENCE
-    while formats.image(scene.shown(second, grey(2))).pixels[0, 0] != 2:
+    while formats.decode_image(scene.shown(second, grey(2))).pixels[0, 0] != 2:
         assert time.monotonic() < until
 
 
-def test_picture_that_was_published_once_is_shown(scene: Scene) -> None:
-    """To who subscribes when it was published long ago, and the next one to who is there."""
+def test_latched_image_arrives_after_the_subscription(scene: Scene) -> None:
     publisher = scene.node.create_publisher(Image, "/map", LATCHED)
     publisher.publish(grey(3))
     for _ in range(2):
         subscribed = scene.cameras.subscribe("/map", False, "", scene.got.put)
-        assert formats.image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 3
+        assert formats.decode_image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 3
         assert subscribed.latched
     publisher.publish(grey(4))
-    assert formats.image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 4
+    assert formats.decode_image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 4
 
 
-def test_picture_of_a_camera_that_comes_later_is_shown_once(scene: Scene) -> None:
-    """Subscribed anew for its publisher's sake it would come again."""
+def test_latched_image_of_a_later_publisher_arrives_once(scene: Scene) -> None:
     subscribed = scene.cameras.subscribe("/map", False, "", scene.got.put)
     publisher = scene.node.create_publisher(Image, "/map", LATCHED)
     publisher.publish(grey(3))
@@ -120,15 +118,14 @@ def test_picture_of_a_camera_that_comes_later_is_shown_once(scene: Scene) -> Non
     while not subscribed.latched:
         assert time.monotonic() < until
         time.sleep(0.02)  # publishers are looked at once a second
-    assert formats.image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 3
+    assert formats.decode_image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 3
     with pytest.raises(queue.Empty):
         scene.got.get(timeout=0.5)  # to prove its absence
     publisher.publish(grey(3))
     assert scene.got.get(timeout=PATIENCE)
 
 
-def test_publishers_that_keep_nothing_are_heard_beside_one_that_does(scene: Scene) -> None:
-    """Who asks for kept pictures gets none of theirs."""
+def test_volatile_publishers_are_received_beside_a_latched_one(scene: Scene) -> None:
     latched = scene.node.create_publisher(Image, "/grey", LATCHED)
     volatile = scene.node.create_publisher(Image, "/grey", BEST_EFFORT)
     subscribed = scene.cameras.subscribe("/grey", False, "", scene.got.put)
@@ -137,13 +134,12 @@ def test_publishers_that_keep_nothing_are_heard_beside_one_that_does(scene: Scen
     while seen != {1, 2}:
         assert time.monotonic() < until
         for level, publisher in ((1, latched), (2, volatile)):
-            seen.add(int(formats.image(scene.shown(publisher, grey(level))).pixels[0, 0]))
+            seen.add(int(formats.decode_image(scene.shown(publisher, grey(level))).pixels[0, 0]))
     assert not subscribed.latched
 
 
 @pytest.mark.parametrize("asked", ["default", "sensor_data"])
-def test_profile_asked_for_by_name_keeps_nothing(scene: Scene, asked: str) -> None:
-    """As ROS has it by that name."""
+def test_named_profiles_are_volatile(scene: Scene, asked: str) -> None:
     scene.node.create_publisher(Image, "/map", LATCHED)
     scene.cameras.subscribe("/map", False, asked, scene.got.put)
     until = time.monotonic() + PATIENCE
@@ -153,15 +149,13 @@ def test_profile_asked_for_by_name_keeps_nothing(scene: Scene, asked: str) -> No
     assert scene.offered("/map").durability == DurabilityPolicy.VOLATILE
 
 
-def test_compressed_pictures_come_as_they_are(scene: Scene) -> None:
-    """Byte for byte."""
+def test_compressed_images_are_unchanged(scene: Scene) -> None:
     publisher = scene.node.create_publisher(CompressedImage, "/files", BEST_EFFORT)
     scene.cameras.subscribe("/files", True, "", scene.got.put)
     assert b"some bytes" in scene.shown(publisher, CompressedImage(format="jpeg", data=b"some bytes"))
 
 
 def test_closed_subscription_leaves_the_graph(scene: Scene) -> None:
-    """And passes on nothing any more."""
     publisher = scene.node.create_publisher(Image, "/grey", BEST_EFFORT)
     subscribed = scene.cameras.subscribe("/grey", False, "", scene.got.put)
     scene.shown(publisher, grey(1))

@@ -1,4 +1,4 @@
-"""What the robot's own diagnostics say is wrong."""
+"""Alerts from the robot's diagnostics."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ import pytest
 import pytest_twisted
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.serialization import serialize_message
-from switchboard_diagnostics import reporting
-from switchboard_processes import Process, running
 
 from relay_protocol.link import Topic
 from robot_client.platforms.base import GraphView, OnSample
-from robot_client.platforms.ros2.diagnostics import (
+from robot_client.platforms.ros2.health import (
     BURST,
     DIAGNOSTICS,
-    GAPS,
-    KNOWN,
-    NAMES,
-    PERIODS,
-    SILENT,
+    MAX_GAPS,
+    MAX_NAMES,
+    MIN_GAPS,
+    SILENT_PERIODS,
+    SILENT_SECONDS,
     TOPIC,
     Diagnostics,
 )
 from robot_client.platforms.ros2.platform import Ros2Platform
 from robot_client.platforms.ros2.types import Types
 from tests.robot_client.ros import until
+from tests.worlds.diagnostics_node import reporting
+from tests.worlds.processes import Process, running
 
 OK, WARN, ERROR, STALE = range(4)
 
 
 class Scene:
-    """Diagnostics that listen, and what they tell."""
+    """Diagnostics and the alerts they raise."""
 
     def __init__(self) -> None:
         self.now = 0.0
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.texts: list[str] = []
         self.listeners: list[OnSample] = []
         self.diagnostics = Diagnostics(
@@ -46,27 +46,27 @@ class Scene:
     def _tell(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
         assert kind == "diagnostics"
         self.texts.append(text)
-        self.told.append(f"{about} {'over' if over else level}")
+        self.reported.append(f"{about} {'over' if over else level}")
 
     def listens(self, type: str = DIAGNOSTICS, publishers: tuple[str, ...] = ("/base",)) -> None:
-        """There is such a topic."""
-        self.diagnostics.look(GraphView(topics={TOPIC: Topic(types=[type], publishers=list(publishers))}))
+        """Add the topic to the graph."""
+        self.diagnostics.update(GraphView(topics={TOPIC: Topic(types=[type], publishers=list(publishers))}))
 
-    def regularly(self, period: float, *statuses: tuple[str, int], times: int = 2 * GAPS) -> None:
-        """A node tells how its parts are, again and again."""
+    def regularly(self, period: float, *statuses: tuple[str, int], times: int = 2 * MAX_GAPS) -> None:
+        """Publish the status of names, again and again."""
         for _ in range(times):
             self.passes(period - 0.1)
             self.publish(*statuses)
 
     def passes(self, seconds: float) -> None:
-        """Time goes by, and the graph is looked at."""
+        """Let time pass, with reads of the graph."""
         until = self.now + seconds
         while self.now < until:
             self.now = min(until, self.now + 0.5)
             self.listens()
 
     def publish(self, *statuses: tuple[str, int]) -> None:
-        """A node tells how its parts are."""
+        """Publish the status of names."""
         array = DiagnosticArray()
         array.status = [
             DiagnosticStatus(name=name, level=bytes([level]), message=f"{name} is {level}")
@@ -78,32 +78,30 @@ class Scene:
 
 @pytest.fixture
 def scene() -> Scene:
-    """Nothing is there yet."""
+    """Before the topic exists."""
     return Scene()
 
 
-def test_errors_are_told_once_and_their_end(scene: Scene) -> None:
-    """By name; warnings are no alerts, and end one."""
+def test_error_raises_one_alert_that_ends(scene: Scene) -> None:
+    """Warnings raise none, and end one."""
     scene.listens()
     for levels in ((OK, WARN), (ERROR, WARN), (ERROR, ERROR), (ERROR, OK), (WARN, OK), (ERROR, OK)):
         scene.publish(("motor", levels[0]), ("arm", levels[1]))
-    assert scene.told == ["motor error", "arm error", "arm over", "motor over", "motor error"]
+    assert scene.reported == ["motor error", "arm error", "arm over", "motor over", "motor error"]
     assert scene.texts[0] == "motor is 2"
 
 
-def test_stale_is_told_of_what_was_there(scene: Scene) -> None:
-    """A part that has never come was perhaps never to; one that is stale may turn out to be broken."""
+def test_stale_raises_an_alert_only_for_a_name_that_was_alive(scene: Scene) -> None:
     scene.listens()
     for level in (STALE, STALE, OK, STALE, STALE, ERROR, OK, STALE, OK):
         scene.publish(("lidar", level))
-    assert scene.told == ["lidar warning", "lidar error", "lidar over", "lidar warning", "lidar over"]
+    assert scene.reported == ["lidar warning", "lidar error", "lidar over", "lidar warning", "lidar over"]
 
 
-def test_it_listens_once_to_what_is_published_with_the_right_type(scene: Scene) -> None:
-    """A topic without a publisher, or of another type, is let be."""
+def test_topic_is_subscribed_once_with_a_publisher_of_the_right_type(scene: Scene) -> None:
     scene.listens("std_msgs/msg/String")
     scene.listens(publishers=())
-    scene.diagnostics.look(GraphView())
+    scene.diagnostics.update(GraphView())
     assert scene.listeners == []
     scene.listens()
     scene.listens()
@@ -111,152 +109,141 @@ def test_it_listens_once_to_what_is_published_with_the_right_type(scene: Scene) 
 
 
 def test_names_are_bounded(scene: Scene) -> None:
-    """Those beyond are passed over, and the others go on."""
     scene.listens()
-    scene.publish(*((f"part {number}", ERROR) for number in range(NAMES + 50)))
-    assert len(scene.told) == NAMES
+    scene.publish(*((f"part {number}", ERROR) for number in range(MAX_NAMES + 50)))
+    assert len(scene.reported) == MAX_NAMES
     scene.publish(("part 0", OK))
-    assert scene.told[-1] == "part 0 over"
+    assert scene.reported[-1] == "part 0 over"
 
 
-def test_a_flood_is_not_read(scene: Scene) -> None:
-    """The daemon has other things to do."""
+def test_messages_over_the_rate_are_skipped(scene: Scene) -> None:
     scene.listens()
     for number in range(1000):
         scene.now -= 0.1
         scene.publish((f"part {number % 100}", ERROR))
-    assert len(scene.told) == BURST
+    assert len(scene.reported) == BURST
     scene.now += 10
     scene.publish(("other", ERROR))
-    assert scene.told[-1] == "other error"
+    assert scene.reported[-1] == "other error"
 
 
 @pytest.mark.parametrize("body", [b"", b"\0\1\0\0\xff", b"\0\1\0\0" + b"\xff" * 64])
-def test_what_is_no_diagnostics_is_passed_over(scene: Scene, body: bytes) -> None:
-    """Any node may publish anything there."""
+def test_invalid_messages_are_ignored(scene: Scene, body: bytes) -> None:
     scene.listens()
     scene.listeners[0](body)
-    assert scene.told == []
+    assert scene.reported == []
 
 
 @pytest.mark.parametrize("level", [OK, WARN])
-def test_a_name_that_ceases_is_told_and_over_when_it_reports_again(scene: Scene, level: int) -> None:
-    """Its node has crashed, perhaps; it is told once."""
+def test_silent_name_raises_one_alert_that_ends(scene: Scene, level: int) -> None:
     scene.listens()
     scene.regularly(1.0, ("arm", level))
-    scene.passes(SILENT - 0.1)
-    assert scene.told == []
+    scene.passes(SILENT_SECONDS - 0.1)
+    assert scene.reported == []
     scene.passes(60)
-    assert (scene.told, scene.texts) == (["arm warning"], ["arm reports nothing any more"])
+    assert (scene.reported, scene.texts) == (["arm warning"], ["arm reports nothing any more"])
     scene.publish(("arm", level))
-    assert scene.told == ["arm warning", "arm over"]
+    assert scene.reported == ["arm warning", "arm over"]
 
 
-def test_only_the_name_that_ceases_is_told(scene: Scene) -> None:
-    """Others go on."""
+def test_other_names_raise_no_alert(scene: Scene) -> None:
     scene.listens()
     scene.regularly(1.0, ("arm", OK), ("leg", OK))
     scene.regularly(1.0, ("leg", OK))
-    assert scene.told == ["arm warning"]
+    assert scene.reported == ["arm warning"]
 
 
-def test_what_reports_seldom_is_waited_for_as_long_as_that_takes(scene: Scene) -> None:
-    """Several of its usual periods."""
+def test_silence_counts_by_the_usual_period(scene: Scene) -> None:
     scene.listens()
     scene.regularly(10.0, ("disk", OK))
-    scene.passes(PERIODS * 10 - 1)
-    assert scene.told == []
+    scene.passes(SILENT_PERIODS * 10 - 1)
+    assert scene.reported == []
     scene.passes(2)
-    assert scene.told == ["disk warning"]
+    assert scene.reported == ["disk warning"]
 
 
-def test_a_name_without_a_usual_period_is_not_told_as_silent(scene: Scene) -> None:
-    """Heard once, too seldom, or only in a burst as when it begins."""
+def test_name_without_a_usual_period_is_never_silent(scene: Scene) -> None:
     scene.listens()
     scene.publish(("once", OK))
-    scene.regularly(1.0, ("seldom", OK), times=KNOWN)
+    scene.regularly(1.0, ("seldom", OK), times=MIN_GAPS)
     for _ in range(20):
         scene.now -= 0.1
         scene.publish(("burst", OK))
     scene.passes(1000)
-    assert scene.told == []
+    assert scene.reported == []
 
 
-def test_what_was_in_error_and_ceases_is_still_one(scene: Scene) -> None:
-    """Nobody has said that it is well; with what it said last, and with its own words when it is back."""
+def test_silence_after_an_error_stays_an_error(scene: Scene) -> None:
+    """With its last text."""
     scene.listens()
     scene.regularly(1.0, ("arm", ERROR))
     scene.passes(10)
     scene.publish(("arm", ERROR))
     scene.publish(("arm", OK))
-    assert scene.told == ["arm error", "arm error", "arm error", "arm over"]
+    assert scene.reported == ["arm error", "arm error", "arm error", "arm over"]
     assert scene.texts[1] == "arm reports nothing any more; it was in ERROR: arm is 2"
 
 
 @pytest.mark.parametrize(
-    ("before", "back", "told"),
+    ("before", "back", "reported"),
     [(OK, "lidar warning", 2), (STALE, "lidar over", 1)],
 )
-def test_a_name_that_is_back_as_stale_is_as_if_it_had_begun(
-    scene: Scene, before: int, back: str, told: int
+def test_name_that_returns_as_stale_counts_as_new(
+    scene: Scene, before: int, back: str, reported: int
 ) -> None:
-    """What it waits for was there before it crashed, or never was."""
     scene.listens()
     scene.regularly(1.0, ("lidar", before))
     scene.passes(10)
     scene.publish(("lidar", STALE))
-    assert scene.told == ["lidar warning", back]
+    assert scene.reported == ["lidar warning", back]
     assert scene.texts[1] == "lidar is 3"
     scene.publish(("lidar", OK))
-    assert len([each for each in scene.told if each == "lidar over"]) == 1
-    assert len(scene.told) == told + 1
+    assert len([each for each in scene.reported if each == "lidar over"]) == 1
+    assert len(scene.reported) == reported + 1
 
 
-def test_a_daemon_that_stood_still_calls_nobody_silent_before_it_has_read_what_came(scene: Scene) -> None:
-    """It looks at the graph first, and then hears what waited."""
+def test_suspended_daemon_reads_its_messages_before_it_reports_silence(scene: Scene) -> None:
     scene.listens()
     scene.regularly(1.0, ("arm", OK), ("leg", OK))
     scene.now += 60
     scene.listens()
     scene.publish(("arm", OK))
     scene.passes(1)
-    assert scene.told == ["leg warning"]
+    assert scene.reported == ["leg warning"]
 
 
-def test_a_daemon_that_looks_seldom_sees_silence_as_well(scene: Scene) -> None:
-    """How often the graph is looked at is a setting."""
+def test_silence_is_detected_at_any_rate_of_checks(scene: Scene) -> None:
     scene.listens()
     scene.regularly(1.0, ("arm", OK))
     for _ in range(3):
         scene.now += 10
         scene.listens()
-    assert scene.told == ["arm warning"]
+    assert scene.reported == ["arm warning"]
 
 
-def test_nobody_is_silent_while_more_comes_than_is_read(scene: Scene) -> None:
-    """What is passed over may have been anybody's."""
+def test_no_name_is_silent_while_messages_are_skipped(scene: Scene) -> None:
     scene.listens()
     scene.regularly(1.0, ("arm", OK))
     for _ in range(2000):
         scene.now -= 0.09
         scene.publish(("other", OK))
         scene.listens()
-    assert scene.told == []
+    assert scene.reported == []
     scene.regularly(1.0, ("other", OK))
-    assert scene.told == ["arm warning"]
+    assert scene.reported == ["arm warning"]
 
 
 @pytest.mark.parametrize("ros", ["events"], indirect=True, scope="module")
 @pytest_twisted.ensureDeferred
-async def test_a_node_that_is_killed_is_told_and_over_when_it_begins_again(
+async def test_a_killed_node_is_reported_until_it_restarts(
     ros: Ros2Platform, environment: dict[str, str], tmp_path: Path
 ) -> None:
     """In a real graph, where it reports ten times a second."""
-    told: list[str] = []
+    reported: list[str] = []
     heard: list[bytes] = []
 
     def tell(level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
-        told.append(f"{kind} {about} {'over' if over else level}: {text}")
+        reported.append(f"{kind} {about} {'over' if over else level}: {text}")
 
     ros.on_alert = tell
     ros.subscribe(TOPIC, DIAGNOSTICS, None, heard.append, lambda: None)
@@ -268,9 +255,9 @@ async def test_a_node_that_is_killed_is_told_and_over_when_it_begins_again(
     node = begun()
     with running(node):
         await until(lambda: ros.graph() and len(heard) > 50)
-        assert told == []
+        assert reported == []
         node.kill()
         silent = "diagnostics motor warning: motor reports nothing any more"
-        await until(lambda: ros.graph() and told == [silent])
+        await until(lambda: ros.graph() and reported == [silent])
     with running(begun()):
-        await until(lambda: ros.graph() and told == [silent, "diagnostics motor over: all is well"])
+        await until(lambda: ros.graph() and reported == [silent, "diagnostics motor over: all is well"])

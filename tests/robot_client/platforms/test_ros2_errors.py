@@ -1,11 +1,11 @@
-"""Words of errors that reach people who did not build ROS."""
+"""Texts of errors for people who did not build ROS."""
 
 from __future__ import annotations
 
 import pytest
 
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.platforms.ros2.errors import in_words, refusals
+from robot_client.platforms.ros2.errors import error_text, refusals
 
 
 @pytest.mark.parametrize(
@@ -19,13 +19,12 @@ from robot_client.platforms.ros2.errors import in_words, refusals
         ("", "RuntimeError"),
     ],
 )
-def test_places_in_sources_are_left_out(said: str, left: str) -> None:
-    """From the first path on it is of no use to who reads it."""
-    assert in_words(RuntimeError(said)) == left
+def test_source_locations_are_left_out(said: str, left: str) -> None:
+    assert error_text(RuntimeError(said)) == left
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "reported"),
     [
         (
             RuntimeError("wrong type, at /project/src/a.c:1"),
@@ -34,8 +33,7 @@ def test_places_in_sources_are_left_out(said: str, left: str) -> None:
         (NotFound("there is no /a"), NotFound("there is no /a")),
     ],
 )
-def test_refusals_are_told_in_words(error: Exception, told: Exception) -> None:
-    """What ROS 2 throws becomes a sentence about what was tried; what is one already stays."""
-    with pytest.raises(type(told)) as caught, refusals("the service /a"):
+def test_errors_of_ros_become_sentences(error: Exception, reported: Exception) -> None:
+    with pytest.raises(type(reported)) as caught, refusals("the service /a"):
         raise error
-    assert str(caught.value) == str(told)
+    assert str(caught.value) == str(reported)

@@ -1,4 +1,4 @@
-"""The way from the executor's thread to the reactor."""
+"""Calls from the executor's thread to the reactor, and back."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rclpy.signals import SignalHandlerOptions
 from twisted.internet import reactor as real_reactor
 
 from robot_client.platforms.ros2.executor import (
-    BACKLOG,
+    MAX_BACKLOG,
+    SPIN_SECONDS,
     STUCK_SECONDS,
-    TURN,
     ReactorBridge,
     Spinner,
     make_executor,
@@ -41,7 +41,7 @@ class Reactor:
 
 
 def test_batch_wakes_the_reactor_once() -> None:
-    """Many calls put before the reactor turns need one wake-up and come in order."""
+    """In order."""
     reactor, got = Reactor(), list[int]()
     hop = ReactorBridge(reactor)
     for number in range(100):
@@ -54,20 +54,31 @@ def test_batch_wakes_the_reactor_once() -> None:
     assert got[-1] == 100
 
 
-def test_stalled_reactor_does_not_eat_the_memory() -> None:
-    """Samples over the bound are dropped and counted; answers of services are not."""
+def test_samples_for_a_stalled_reactor_are_bounded() -> None:
+    """Responses are not dropped."""
     reactor, got = Reactor(), list[Any]()
     hop = ReactorBridge(reactor)
     for _ in range(40):
-        hop.put(got.append, "sample", BACKLOG // 32)
+        hop.put(got.append, "sample", MAX_BACKLOG // 32)
     hop.put(got.append, "answer")
     reactor.turn()
     assert hop.dropped == 8
     assert got == ["sample"] * 32 + ["answer"]
 
 
-def test_nothing_is_lost_between_threads() -> None:
-    """Calls put by several threads while the reactor drains all arrive."""
+def test_a_receiver_is_told_how_many_of_its_samples_were_dropped() -> None:
+    """After the samples that waited, and once for each batch."""
+    reactor, got, lost = Reactor(), list[Any](), list[int]()
+    hop = ReactorBridge(reactor)
+    for _ in range(2):
+        for _ in range(40):
+            hop.put(got.append, "sample", MAX_BACKLOG // 32, lost.append)
+        reactor.turn()
+    assert lost == [8, 8]
+    assert len(got) == 64
+
+
+def test_no_call_is_lost_between_threads() -> None:
     reactor, got = Reactor(), list[int]()
     hop = ReactorBridge(reactor)
     threads = [
@@ -81,11 +92,10 @@ def test_nothing_is_lost_between_threads() -> None:
     assert sorted(got) == sorted([*range(5000)] * 3)
 
 
-def test_sample_alone_is_as_large_as_it_is() -> None:
-    """Bytes that are put as they are count with their length."""
+def test_size_of_a_sample_defaults_to_its_length() -> None:
     reactor, got = Reactor(), list[bytes]()
     hop = ReactorBridge(reactor)
-    sample = bytes(BACKLOG // 2)
+    sample = bytes(MAX_BACKLOG // 2)
     for _ in range(3):
         hop.put(got.append, sample, None)
     reactor.turn()
@@ -102,7 +112,7 @@ def in_threads(count: int, put: Callable[[int], None]) -> list[threading.Thread]
 
 @pytest_twisted.ensureDeferred
 async def test_bell_wakes_the_reactor_and_loses_nothing() -> None:
-    """What threads put arrives by the bell, each thread's in its order, without the reactor's own way."""
+    """Calls from threads arrive by the waker, each thread's in order, without the reactor's own wake-up."""
     reactor, got = Reactor(), list[int]()
     hop = ReactorBridge(reactor)
     hop.open(real_reactor)
@@ -118,8 +128,8 @@ async def test_bell_wakes_the_reactor_and_loses_nothing() -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_is_put_while_the_bell_goes_arrives() -> None:
-    """Calls put before, while and after the bell is taken away arrive, then by the reactor's own way."""
+async def test_entry_queued_during_the_wake_up_arrives() -> None:
+    """Calls before, during and after the waker's removal arrive, the last ones by the reactor's own wake-up."""
     got = list[int]()
     hop = ReactorBridge(real_reactor.callFromThread)  # type: ignore[attr-defined]  # to mypy a module
     hop.open(real_reactor)
@@ -133,11 +143,11 @@ async def test_what_is_put_while_the_bell_goes_arrives() -> None:
 
 @pytest_twisted.ensureDeferred
 async def test_bell_the_reactor_gave_up_is_replaced() -> None:
-    """When the reactor drops its readers, the hop goes on by the reactor's own way."""
+    """When the reactor drops its readers, calls use its own wake-up."""
     reactor, got = Reactor(), list[int]()
     hop = ReactorBridge(reactor)
     hop.open(real_reactor)
-    bell = hop._bell
+    bell = hop._waker
     assert bell is not None
     hop.put(got.append, 1)
     bell.connectionLost(None)
@@ -147,8 +157,7 @@ async def test_bell_the_reactor_gave_up_is_replaced() -> None:
     assert got == [1, 2]
 
 
-def test_no_bell_is_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without an eventfd, of the system or at all, the reactor's own way is used."""
+def test_bridge_works_without_an_eventfd(monkeypatch: pytest.MonkeyPatch) -> None:
     reactor, got = Reactor(), list[int]()
     hop = ReactorBridge(reactor)
 
@@ -166,8 +175,7 @@ def test_no_bell_is_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
     assert got == [1, 2]
 
 
-def test_failing_receiver_costs_nobody_else() -> None:
-    """A receiver that throws does not lose the others their calls."""
+def test_failing_receiver_does_not_affect_others() -> None:
     reactor, got = Reactor(), list[int]()
     hop = ReactorBridge(reactor)
     hop.put(lambda _: 1 / 0, None)
@@ -176,9 +184,7 @@ def test_failing_receiver_costs_nobody_else() -> None:
     assert got == [1]
 
 
-def test_executor_that_serves_nothing_is_noticed() -> None:
-    """Five seconds without the node's own timer mean that the executor is stuck; a beat means it is not."""
-
+def test_executor_without_callbacks_for_five_seconds_is_stuck() -> None:
     class Node:
         def create_timer(self, period: float, beat: Callable[[], None], clock: object) -> None:
             self.beat = beat
@@ -190,13 +196,13 @@ def test_executor_that_serves_nothing_is_noticed() -> None:
     now, node = [0.0], Node()
     spinner = Spinner(Executor(), node, None, lambda: now[0])
     now[0] = STUCK_SECONDS + 1
-    assert "served nothing" in str(spinner.trouble())
+    assert "run no callback" in str(spinner.fault())
     node.beat()
-    assert spinner.trouble() is None
+    assert spinner.fault() is None
 
 
 class Tasks:
-    """An executor that runs its tasks when told, the newest first, as rclpy's does."""
+    """An executor that runs its tasks on request, the newest first, as rclpy's does."""
 
     def __init__(self) -> None:
         self.tasks: list[Callable[[], None]] = []
@@ -217,32 +223,30 @@ class Timers:
         pass
 
 
-def test_work_for_the_executor_is_done_in_order() -> None:
-    """What is given to the executor's thread is done there in the order it came, by one task."""
+def test_calls_on_the_executors_thread_run_in_order() -> None:
+    """By one task."""
     tasks, done = Tasks(), list[int]()
     spinner = Spinner(tasks, Timers(), None)
     for number in range(5):
-        spinner.do(done.append, number)
+        spinner.call(done.append, number)
     assert len(tasks.tasks) == 1
     tasks.turn()
-    spinner.do(done.append, 5)
+    spinner.call(done.append, 5)
     tasks.turn()
     assert done == [0, 1, 2, 3, 4, 5]
 
 
-def test_work_that_fails_costs_no_other() -> None:
-    """A request that ROS refuses does not lose those behind it."""
+def test_failing_call_does_not_affect_later_ones() -> None:
     tasks, done = Tasks(), list[int]()
     spinner = Spinner(tasks, Timers(), None)
-    spinner.do(lambda: 1 / 0)
-    spinner.do(done.append, 1)
+    spinner.call(lambda: 1 / 0)
+    spinner.call(done.append, 1)
     tasks.turn()
     assert done == [1]
 
 
 @pytest.mark.parametrize("kind", ["events", "single"])
-def test_executor_at_rest_serves_and_ends(kind: str, environment: dict[str, str]) -> None:
-    """While nothing happens in the graph, work is done, the node's timer beats, and the thread ends when told."""
+def test_idle_executor_runs_calls_and_stops(kind: str, environment: dict[str, str]) -> None:
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("spun", context=context, start_parameter_services=False, enable_rosout=False)
@@ -261,15 +265,15 @@ def test_executor_at_rest_serves_and_ends(kind: str, environment: dict[str, str]
     try:
         spinner.start()
         done = threading.Event()
-        spinner.do(done.set)
+        spinner.call(done.set)
         assert done.wait(60)
-        served = spinner._served
+        served = spinner._last_callback
         end = time.monotonic() + 60
-        while spinner._served == served and time.monotonic() < end:
+        while spinner._last_callback == served and time.monotonic() < end:
             time.sleep(0.01)  # the beat comes from another thread
-        assert spinner._served > served
-        assert spinner.trouble() is None
-        assert set(turns) == {TURN}
+        assert spinner._last_callback > served
+        assert spinner.fault() is None
+        assert set(turns) == {SPIN_SECONDS}
     finally:
         spinner.stop()
         assert not spinner._thread.is_alive()

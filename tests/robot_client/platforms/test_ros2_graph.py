@@ -7,15 +7,14 @@ import pytest_twisted
 
 from relay_protocol import link
 from robot_client.platforms.ros2.platform import Ros2Platform
-from tests.robot_client.platforms.ends import STRING, Listener, seen
 from tests.robot_client.ros import Peer
+from tests.worlds.ros_endpoints import STRING, Listener, seen
 
 pytestmark = pytest.mark.parametrize("ros", ["events"], indirect=True, scope="module")
 
 
 @pytest_twisted.ensureDeferred
-async def test_graph_has_others_and_not_us(ros: Ros2Platform, peer: Peer) -> None:
-    """The graph names the ends of every topic and service, without our own node and what it alone made."""
+async def test_graph_has_other_nodes_only(ros: Ros2Platform, peer: Peer) -> None:
     peer.do("advertise", "/theirs")
     Listener(ros, "/ours", STRING)
     Listener(ros, "/theirs", STRING)
@@ -29,8 +28,7 @@ async def test_graph_has_others_and_not_us(ros: Ros2Platform, peer: Peer) -> Non
 
 
 @pytest_twisted.ensureDeferred
-async def test_graph_forgets_what_is_gone(ros: Ros2Platform, peer: Peer) -> None:
-    """A topic whose last end went is out of the graph."""
+async def test_topics_without_endpoints_leave_the_graph(ros: Ros2Platform, peer: Peer) -> None:
     peer.do("advertise", "/brief")
     await seen(ros, lambda graph: "/brief" in graph.topics)
     peer.do("unadvertise", "/brief")

@@ -11,10 +11,10 @@ import rclpy
 from geometry_msgs.msg import Twist
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from robot_client.motion.guard import PUBLISHERS, RosOutlets
+from robot_client.motion.guard import PUBLISHERS, RosStopOutputs
 from robot_client.motion.typed_topic import TypedTopic
 
-outlets = RosOutlets("switchboard_guard_test", False)
+outputs = RosStopOutputs("switchboard_guard_test", False)
 on = TypedTopic("/cmd_vel", "geometry_msgs/msg/Twist")
 context = rclpy.Context()
 rclpy.init(context=context)
@@ -29,12 +29,12 @@ def wait(true):
 
 
 def stopped(subscription):
-    return lambda: outlets.zero(on, b"") and subscription.handle.take_message(Twist, False)
+    return lambda: outputs.zero(on, b"") and subscription.handle.take_message(Twist, False)
 
 
 plain = base.create_subscription(Twist, "/cmd_vel", print, 1)
-outlets.open(on)
-wait(lambda: outlets.heard(on))
+outputs.open(on)
+wait(lambda: outputs.is_matched(on))
 wait(stopped(plain))
 strict = base.create_subscription(Twist, "/cmd_vel", print, QoSProfile(depth=1, deadline=Duration(seconds=1)))
 wait(stopped(strict))
@@ -43,9 +43,9 @@ latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 base.create_subscription(Twist, "/cmd_vel", print, latched)
 wait(lambda: base.count_subscribers("/cmd_vel") == 3)
 for _ in range(20):
-    outlets.zero(on, b"")
-print(len(outlets._publishers[on]), len(outlets._publishers[on]) < PUBLISHERS)
-outlets.close(on)
+    outputs.zero(on, b"")
+print(len(outputs._publishers[on]), len(outputs._publishers[on]) < PUBLISHERS)
+outputs.close(on)
 wait(lambda: base.count_publishers("/cmd_vel") == 0)
 base.destroy_node()
 rclpy.shutdown(context=context)

@@ -1,4 +1,4 @@
-"""What publishers keep, in a real graph, with each of the executors."""
+"""Latched samples in a real graph, with each of the executors."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from std_msgs.msg import String
 from relay_protocol import link
 from robot_client.platforms.ros2 import topics
 from robot_client.platforms.ros2.platform import Ros2Platform
-from robot_client.platforms.ros2.topics import Stamps
-from tests.robot_client.platforms.ends import STRING, Listener, node
+from robot_client.platforms.ros2.topics import LatchedStamps
 from tests.robot_client.ros import until
+from tests.worlds.ros_endpoints import STRING, Listener, node
 
 
 @pytest.fixture(scope="module")
 def three(environment: dict[str, str]) -> Iterator[list[Any]]:
-    """Nodes that are not the platform's."""
+    """Nodes other than the platform's."""
     with ExitStack() as stack:
         yield [stack.enter_context(node(f"node_{name}")) for name in "abc"]
 
@@ -31,8 +31,8 @@ def kept(depth: int = 1) -> QoSProfile:
     return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-class Taker(Listener):
-    """A subscription, and the stamps of what came of it."""
+class Receiver(Listener):
+    """A subscription, and the stamps of its samples."""
 
     def __init__(self, ros: Ros2Platform, topic: str, qos: link.QoS | None = None) -> None:
         self.stamps: dict[str, int] = {}
@@ -44,23 +44,23 @@ class Taker(Listener):
         self.stamps[self.texts[-1]] = self.source.stamp
 
     async def recalled(self, enough: Callable[[dict[int, str]], bool]) -> dict[int, str]:
-        """What publishers keep, by stamp."""
+        """Samples that publishers keep, by stamp."""
         found: dict[int, str] = {}
 
         def keep(stamp: int, body: bytes) -> None:
             found[stamp] = deserialize_message(body, String).data
 
         ended: list[bool] = []
-        self.source.recall(keep, lambda: ended.append(True))
+        self.source.request_latched(keep, lambda: ended.append(True))
         await until(lambda: enough(found))
-        self.source._end_recall()
+        self.source._end_request()
         assert ended == [True]
         return found
 
 
 @pytest_twisted.ensureDeferred
-async def test_each_publisher_is_asked_for_what_it_keeps(ros: Ros2Platform, three: list[Any]) -> None:
-    """By its own depth, with the stamps that the messages had when they first came."""
+async def test_latched_samples_of_each_publisher_are_fetched(ros: Ros2Platform, three: list[Any]) -> None:
+    """By its depth, with the stamps of their first arrival."""
     topic = "/recalled"
     publishers = [
         each.create_publisher(String, topic, kept(depth))
@@ -70,7 +70,7 @@ async def test_each_publisher_is_asked_for_what_it_keeps(ros: Ros2Platform, thre
         for name, publisher in zip("abc", publishers, strict=True):
             publisher.publish(String(data=f"{name}{number}"))
     await until(lambda: len(ros._node.get_publishers_info_by_topic(topic)) == 3)
-    taker = Taker(ros, topic)
+    taker = Receiver(ros, topic)
     expected = {"a6", "b5", "b6", "c2", "c3", "c4", "c5", "c6"}
     await until(lambda: len(taker.bodies) >= len(expected))
     assert set(taker.texts) == expected
@@ -93,20 +93,20 @@ async def test_each_publisher_is_asked_for_what_it_keeps(ros: Ros2Platform, thre
 
 @pytest_twisted.ensureDeferred
 async def test_stamps_outlast_a_subscription(ros: Ros2Platform, three: list[Any]) -> None:
-    """After the loss of a link the same message has the same stamp, so that the relay knows it again."""
+    """The same message has the same stamp."""
     topic = "/outlasts"
     publisher = three[0].create_publisher(String, topic, kept(3))
     for word in ("x", "y"):
         publisher.publish(String(data=word))
     await until(lambda: len(ros._node.get_publishers_info_by_topic(topic)) == 1)
-    before = Taker(ros, topic)
-    other = Taker(ros, topic)
+    before = Receiver(ros, topic)
+    other = Receiver(ros, topic)
     await until(lambda: len(before.bodies) == len(other.bodies) == 2)
     before.source.close()
     publisher.publish(String(data="z"))
-    again = Taker(ros, topic)
+    again = Receiver(ros, topic)
     await until(lambda: len(again.bodies) == 3)
-    assert again.source.replays == before.source.replays != ""
+    assert again.source.stamps_id == before.source.stamps_id != ""
     assert again.texts == ["x", "y", "z"]
     assert (
         {word: again.stamps[word] for word in ("x", "y")}
@@ -120,10 +120,9 @@ async def test_stamps_outlast_a_subscription(ros: Ros2Platform, three: list[Any]
 
 
 @pytest_twisted.ensureDeferred
-async def test_publishers_of_all_kinds_are_heard_once(ros: Ros2Platform, three: list[Any]) -> None:
-    """The subscription is made again with each new kind of publisher, and passes nothing on twice."""
+async def test_samples_of_all_kinds_of_publishers_arrive_once(ros: Ros2Platform, three: list[Any]) -> None:
     topic = "/kinds"
-    taker = Taker(ros, topic)
+    taker = Receiver(ros, topic)
     latched = three[0].create_publisher(String, topic, kept(2))
     latched.publish(String(data="kept"))
     await until(lambda: ros.graph() and "kept" in taker.texts)
@@ -143,7 +142,7 @@ async def test_publishers_of_all_kinds_are_heard_once(ros: Ros2Platform, three: 
         return {"latched", "volatile", "lossy"} <= {text.split()[0] for text in taker.texts}
 
     await until(all_heard)
-    late = Taker(ros, topic)
+    late = Receiver(ros, topic)
     await until(lambda: sum(text.startswith("latched") for text in late.texts) >= 2)
     for each in (taker, late):
         assert len(each.texts) == len(set(each.texts))
@@ -156,30 +155,30 @@ async def test_publishers_of_all_kinds_are_heard_once(ros: Ros2Platform, three: 
 async def test_rclpy_without_message_info(
     ros: Ros2Platform, three: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Humble's tells no messages apart: the relay is told so, and samples come."""
-    monkeypatch.setattr(topics, "TELLS_APART", False)
+    """Humble's identifies no messages."""
+    monkeypatch.setattr(topics, "IDENTIFIES_MESSAGES", False)
     topic = "/humble"
     publisher = three[0].create_publisher(String, topic, kept())
     publisher.publish(String(data="kept"))
     await until(lambda: len(ros._node.get_publishers_info_by_topic(topic)) == 1)
-    taker = Taker(ros, topic)
+    taker = Receiver(ros, topic)
     await until(lambda: taker.texts == ["kept"])
-    assert taker.source.replays == ""
+    assert taker.source.stamps_id == ""
     assert taker.source.stamp == 0
     taker.source.close()
     three[0].destroy_publisher(publisher)
 
 
-def test_stamps_grow_whatever_the_clock_does() -> None:
-    """And what is remembered of messages is bounded."""
+def test_stamps_increase_for_any_clock() -> None:
+    """The memory is bounded."""
     now = iter([1000, 500, 2000, 9, *range(2001, 9000)])
-    stamps = Stamps(lambda: next(now))
-    assert [stamps.of("/a", (number, 1)) for number in (7, 8)] == [1000, 1001]
+    stamps = LatchedStamps(lambda: next(now))
+    assert [stamps.stamp_of("/a", (number, 1)) for number in (7, 8)] == [1000, 1001]
     assert stamps.now() == 2000
-    assert [stamps.of("/a", (number, 1)) for number in (9, 7)] == [2001, 1000]
-    for number in range(topics.KNOWN + 5):
-        stamps.of("/b", (number, 1))
-    assert len(stamps._topics["/b"]) == topics.KNOWN
-    for number in range(topics.KNOWN_TOPICS + 5):
-        stamps.of(f"/t{number}", (1, 1))
-    assert len(stamps._topics) == topics.KNOWN_TOPICS
+    assert [stamps.stamp_of("/a", (number, 1)) for number in (9, 7)] == [2001, 1000]
+    for number in range(topics.MAX_KNOWN + 5):
+        stamps.stamp_of("/b", (number, 1))
+    assert len(stamps._topics["/b"]) == topics.MAX_KNOWN
+    for number in range(topics.MAX_KNOWN_TOPICS + 5):
+        stamps.stamp_of(f"/t{number}", (1, 1))
+    assert len(stamps._topics) == topics.MAX_KNOWN_TOPICS

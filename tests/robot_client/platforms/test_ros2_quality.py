@@ -1,4 +1,4 @@
-"""Publishers of the platform that follow what subscribers ask for, in a real graph."""
+"""Publishers that follow the requests of subscribers, in a real graph."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
 from relay_protocol import link
-from robot_client.motion.motion import MOTION_QOS
+from robot_client.motion.motion_control import MOTION_QOS
 from robot_client.platforms.ros2 import qos as ros2_qos
 from robot_client.platforms.ros2.platform import Ros2Platform
-from tests.robot_client.platforms.ends import STRING, node
 from tests.robot_client.ros import until
+from tests.worlds.ros_endpoints import STRING, node
 
 with_events = pytest.mark.parametrize("ros", ["events"], indirect=True, scope="module")
 
 
 @pytest.fixture
 def other(environment: dict[str, str]) -> Iterator[Any]:
-    """A node that is not the platform's; it never spins."""
+    """Another node; it never spins."""
     with ExitStack() as stack:
         yield stack.enter_context(node("strict"))
 
@@ -38,8 +38,8 @@ def text(words: str) -> bytes:
 
 @with_events
 @pytest_twisted.ensureDeferred
-async def test_publisher_is_made_again_for_a_stricter_subscriber(ros: Ros2Platform, other: Any) -> None:
-    """What is latched goes over; the former publisher leaves when the next one has found the subscriber."""
+async def test_publisher_is_replaced_for_a_stricter_subscriber(ros: Ros2Platform, other: Any) -> None:
+    """Latched messages are copied."""
     topic = "/renewed"
     changes: list[bool] = []
     sink = ros.advertise(topic, STRING, True, None, on_change=lambda: changes.append(True))
@@ -56,8 +56,7 @@ async def test_publisher_is_made_again_for_a_stricter_subscriber(ros: Ros2Platfo
 
 @with_events
 @pytest_twisted.ensureDeferred
-async def test_messages_go_on_while_a_publisher_is_made_again(ros: Ros2Platform, other: Any) -> None:
-    """None is lost and none comes twice to a subscriber that was there before."""
+async def test_no_message_is_lost_or_doubled_during_a_replacement(ros: Ros2Platform, other: Any) -> None:
     topic = "/going_on"
     plain = other.create_subscription(String, topic, print, QoSProfile(depth=1000))
     sink = ros.advertise(topic, STRING, False, None)
@@ -82,8 +81,8 @@ async def test_messages_go_on_while_a_publisher_is_made_again(ros: Ros2Platform,
 
 @with_events
 @pytest_twisted.ensureDeferred
-async def test_who_can_not_be_served_is_told_of_while_there(ros: Ros2Platform, other: Any) -> None:
-    """A wish of the client's, or of the robot's safety, stays; the publisher is not made again in vain."""
+async def test_unmatched_subscribers_are_reported(ros: Ros2Platform, other: Any) -> None:
+    """The publisher is not replaced without need."""
     topic = "/unserved"
     changes: list[bool] = []
     sinks = [
@@ -107,11 +106,10 @@ async def test_who_can_not_be_served_is_told_of_while_there(ros: Ros2Platform, o
 @with_events
 @pytest_twisted.ensureDeferred
 async def test_own_subscriptions_make_no_publisher_durable(ros: Ros2Platform) -> None:
-    """They follow the publishers; what is asked of latched ones for a moment is no subscriber to serve."""
     topic = "/own"
     latched = ros.advertise(topic, STRING, True, None)
     source = ros.subscribe(topic, STRING, None, lambda body: None, lambda: None)
-    source.recall(lambda stamp, body: None, lambda: None)
+    source.request_latched(lambda stamp, body: None, lambda: None)
     await until(lambda: latched.publisher.get_subscription_count() >= 2)
     plain = ros.advertise(topic, STRING, False, None)
     assert plain.publisher.qos_profile.durability == DurabilityPolicy.VOLATILE
@@ -134,16 +132,14 @@ SUBSCRIBERS = st.builds(
 
 
 @given(st.lists(SUBSCRIBERS, max_size=6), st.booleans())
-def test_every_subscriber_is_served_by_the_middlewares_own_rules(
+def test_every_subscriber_is_matched_by_the_middlewares_rules(
     subscribers: list[QoSProfile], latch: bool
 ) -> None:
-    """Whatever each asks for."""
     offered = ros2_qos.for_publisher(subscribers, latch, None)
     assert [ros2_qos.mismatch(offered, each) for each in subscribers] == [""] * len(subscribers)
 
 
 @given(st.lists(SUBSCRIBERS, max_size=6))
-def test_every_publisher_is_heard_by_the_middlewares_own_rules(publishers: list[QoSProfile]) -> None:
-    """By the subscription, if no client asks for more than they offer."""
+def test_every_publisher_is_matched_by_the_middlewares_rules(publishers: list[QoSProfile]) -> None:
     asked = ros2_qos.for_subscription(ros2_qos.match(publishers), None)
     assert [ros2_qos.mismatch(each, asked) for each in publishers] == [""] * len(publishers)

@@ -1,4 +1,4 @@
-"""A node of the robot that is killed and comes back: the platform goes on with it, and nobody has to ask again."""
+"""A node of the robot that is killed and started again."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from std_srvs.srv import SetBool
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
+from robot_client.modules.readiness import check_ready, ready_endpoints
+from robot_client.modules.settings import ModuleSettings
 from robot_client.platforms.base import ABORTED, SUCCEEDED, GoalOutcome
 from robot_client.platforms.ros2.goals import RosGoal
 from robot_client.platforms.ros2.platform import Ros2Platform
@@ -71,16 +73,14 @@ async def invert(ros: Ros2Platform, service: str) -> bool:
 
 def pursue(ros: Ros2Platform, action: str, outcomes: list[GoalOutcome], fed: list[bytes]) -> RosGoal:
     goal = bytes(serialize_message(Fibonacci.Goal(order=4)))
-    begun = ros.pursue(action, "example_interfaces/action/Fibonacci", goal, fed.append)
+    begun = ros.send_goal(action, "example_interfaces/action/Fibonacci", goal, fed.append)
     begun.result.addCallback(outcomes.append)
     return begun
 
 
 @pytest_twisted.ensureDeferred
-async def test_killed_node_is_followed_when_it_comes_back(ros: Ros2Platform, node: Node) -> None:
-    """After a kill and a new start the same subscription hears, the same clients reach service and action; the goal
-    that the dead server had taken ends in words, although another server is there.
-    """
+async def test_subscription_and_clients_work_with_a_restarted_node(ros: Ros2Platform, node: Node) -> None:
+    """The goal of the killed server ends with a reason."""
     await until(lambda: {node.topic} <= set(ros.graph().topics) and node.action in ros.graph().actions)
     heard: list[bytes] = []
     ros.subscribe(node.topic, "", None, heard.append, lambda: None)
@@ -107,10 +107,30 @@ async def test_killed_node_is_followed_when_it_comes_back(ros: Ros2Platform, nod
         raise AssertionError("the service that came back was not reached")
     await until(lambda: lost)
     assert (lost[0].status, lost[0].body) == (ABORTED, None)
-    assert "vanished before the goal ended" in lost[0].reason
+    assert "disappeared before the goal ended" in lost[0].reason
     ends: list[GoalOutcome] = []
     pursue(ros, node.action, ends, [])
     await until(lambda: ends)
     assert ends[0].status == SUCCEEDED
     there = link.Topic(types=["std_msgs/msg/String"], publishers=["/robot/peer"])
     await until(lambda: ros.graph().topics.get(node.topic) == there)
+
+
+@pytest_twisted.ensureDeferred
+async def test_module_is_ready_by_the_endpoints_of_its_new_process(ros: Ros2Platform, node: Node) -> None:
+    """Those of the killed one stay in the graph for a while."""
+    by_topic = ModuleSettings(name="a", command=["a"], ready_topic=node.topic)
+    by_service = ModuleSettings(name="b", command=["b"], ready_service=node.service)
+    first: dict[str, frozenset[bytes]] = {}
+    for each in (by_topic, by_service):
+        await until(lambda each=each: ready_endpoints(each, ros))
+        assert await check_ready(each, ros, frozenset())
+        first[each.name] = ready_endpoints(each, ros)
+
+    node.peer.kill()
+    for each in (by_topic, by_service):
+        assert not await check_ready(each, ros, first[each.name])
+    node.start("count")
+    for each in (by_topic, by_service):
+        await until(lambda each=each: ready_endpoints(each, ros) - first[each.name])
+        assert await check_ready(each, ros, first[each.name])

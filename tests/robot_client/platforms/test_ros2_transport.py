@@ -1,4 +1,4 @@
-"""The daemon shares no memory with other nodes, whatever range of discovery the robot has."""
+"""The daemon uses no shared memory with other nodes, at any discovery range."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from switchboard_domains import free_domain
 
 from relay_protocol.errors import Unavailable
 from robot_client.platforms.ros2.transport import profile, without_shared_memory
+from tests.worlds.ros_domains import free_domain
 
 FASTRTPS = "rmw_fastrtps_cpp"
 CHOICES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
@@ -53,7 +53,7 @@ sys.stdin.read()
 
 @pytest.fixture(autouse=True)
 def _bare(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Nobody has chosen anything."""
+    """Without settings of the robot's owner."""
     for name in CHOICES + RANGES:
         monkeypatch.delenv(name, raising=False)
     yield
@@ -69,8 +69,7 @@ def _bare(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ],
     ids=["localhost", "with peers", "former name", "subnet"],
 )
-def test_a_node_hears_others_and_shares_no_memory(settings: dict[str, str]) -> None:
-    """A node as the daemon makes it finds one with the usual transports, and maps nothing of Fast DDS."""
+def test_node_without_shared_memory_receives_others(settings: dict[str, str]) -> None:
     environment = {**os.environ, **settings, "ROS_DOMAIN_ID": str(free_domain())}
     with subprocess.Popen([sys.executable, "-c", SPEAKER], env=environment, stdin=subprocess.PIPE) as speaker:
         try:
@@ -88,8 +87,7 @@ def test_a_node_hears_others_and_shares_no_memory(settings: dict[str, str]) -> N
     assert listener.stdout.split() == ["hello", "0"], listener.stderr
 
 
-def test_the_environment_is_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What children inherit is what the robot's owner set."""
+def test_environment_is_restored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     before = dict(os.environ)
@@ -102,31 +100,27 @@ def test_the_environment_is_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", CHOICES)
-def test_a_choice_of_the_owner_stands(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who has chosen profiles or transports keeps them."""
+def test_settings_of_the_owner_are_not_changed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(name, "chosen")
     before = dict(os.environ)
     with without_shared_memory(FASTRTPS):
         assert os.environ == before
 
 
-def test_other_middleware_is_left_alone() -> None:
-    """What Fast DDS would read says nothing to others, and they need the range as it is."""
+def test_other_middleware_is_not_changed() -> None:
     before = dict(os.environ)
     with without_shared_memory("rmw_cyclonedds_cpp"):
         assert os.environ == before
 
 
-def test_peers_are_looked_for_beside_this_machine() -> None:
-    """A robot that stays on its machine but for some peers asks those too, and listens to more than the loopback."""
+def test_static_peers_are_discovered() -> None:
     settings = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "127.0.0.3; localhost"}
-    told = ElementTree.fromstring(profile(settings))
-    addresses = [each.text for each in told.iter() if each.tag.endswith("}address")]
+    reported = ElementTree.fromstring(profile(settings))
+    addresses = [each.text for each in reported.iter() if each.tag.endswith("}address")]
     assert addresses == ["127.0.0.1", "127.0.0.3", "127.0.0.1"]
 
 
-def test_a_peer_nobody_knows_is_named() -> None:
-    """ROS 2 itself would not start either."""
+def test_unknown_peer_is_named_in_the_error() -> None:
     settings = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "nobody.invalid"}
     with pytest.raises(Unavailable, match=r"nobody\.invalid"):
         profile(settings)

@@ -1,4 +1,4 @@
-"""Types of ROS 2 by name."""
+"""ROS 2 types by name."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from trajectory_msgs.msg import (
 )
 
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.platforms.base import Motion
-from robot_client.platforms.ros2.motion import JOY
+from robot_client.platforms.base import CommandEffect
+from robot_client.platforms.ros2.command_classifier import JOY
 from robot_client.platforms.ros2.types import Types, introspected
-from tests.robot_client.platforms.ends import STAMPED, TWIST
+from tests.worlds.ros_endpoints import STAMPED, TWIST
 
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
@@ -36,11 +36,10 @@ KINDS = {
 
 
 @pytest.mark.parametrize(("kind", "other"), list(itertools.permutations(KINDS, 2)))
-def test_a_type_known_as_one_kind_is_no_other(kind: str, other: str) -> None:
-    """Its library would end the process where another kind is wanted."""
+def test_type_of_one_kind_is_refused_as_another(kind: str, other: str) -> None:
     types = Types()
     getattr(types, kind)(KINDS[kind])
-    with pytest.raises(Invalid, match=f"{KINDS[kind]} is no type of "):
+    with pytest.raises(Invalid, match=f"{KINDS[kind]} is not one of the "):
         getattr(types, other)(KINDS[kind])
 
 
@@ -55,26 +54,24 @@ def test_a_type_known_as_one_kind_is_no_other(kind: str, other: str) -> None:
         ("message", "action_msgs/srv/CancelGoal_Event", {"info", "request", "response"}),
     ],
 )
-def test_what_is_made_of_a_service_or_an_action_is_a_message(kind: str, name: str, fields: set[str]) -> None:
-    """As its publishers name it."""
+def test_derived_message_types_are_found(kind: str, name: str, fields: set[str]) -> None:
     assert set(getattr(Types(), kind)(name).get_fields_and_field_types()) == fields
 
 
 @pytest.mark.parametrize("name", ["Fibonacci_SendGoal", "Fibonacci_GetResult"])
-def test_an_action_has_services(name: str) -> None:
-    """They are no messages, and a message is none of them."""
+def test_services_of_an_action_are_found(name: str) -> None:
     full = f"example_interfaces/action/{name}"
     assert Types().service(full).Request
     for found, other in ((Types().message, full), (Types().service, f"{full}_Request")):
-        with pytest.raises(Invalid, match="is no type of "):
+        with pytest.raises(Invalid, match="is not one of the "):
             found(other)
 
 
 @pytest.mark.parametrize("kind", ["msg", "srv", "action"])
-def test_naming_a_type_runs_no_code_that_is_no_ros_interface(
+def test_only_packages_of_interfaces_are_imported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    """Clients choose the names, and Python runs a package to look into it: one that may even end the process."""
+    """Clients choose the names."""
     (tmp_path / "switchboard_scripts").mkdir()
     (tmp_path / "switchboard_scripts" / "__init__.py").write_text("raise SystemExit('was run')")
     (tmp_path / "switchboard_script.py").write_text("raise SystemExit('was run')")
@@ -90,14 +87,12 @@ def test_naming_a_type_runs_no_code_that_is_no_ros_interface(
 
 
 @pytest.mark.parametrize("name", ["std_srvs/srv/Trigger_Request", "std_srvs/srv/Trigger_Event"])
-def test_a_part_of_a_service_has_no_definition_of_its_own(name: str) -> None:
-    """Newer releases of ROS have classes of these names beside the service."""
+def test_parts_of_a_service_have_no_definition(name: str) -> None:
     with pytest.raises(NotFound, match="is not installed on this robot"):
         Types().definition(name)
 
 
 def test_definition_has_all_parts_and_hash() -> None:
-    """A definition from the installed files holds every contained type, and the distribution's hash."""
     types = Types()
     found = types.definition(STAMPED)
     for part in (
@@ -111,8 +106,7 @@ def test_definition_has_all_parts_and_hash() -> None:
     assert types.definition(KINDS["service"]).text.startswith("---\nbool success")
 
 
-def test_introspection_says_the_same_as_the_file() -> None:
-    """Where a robot has no .msg files, the class gives the same fields in the same order."""
+def test_introspected_definition_equals_the_file() -> None:
     assert introspected(Twist, "msg") == "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
     assert "uint8[] data\n" in introspected(Image, "msg")
     assert "POWER_SUPPLY_STATUS_FULL=4\n" in introspected(BatteryState, "msg")
@@ -122,88 +116,90 @@ def test_introspection_says_the_same_as_the_file() -> None:
     assert introspected(Trigger, "srv") == "---\nbool success\nstring message\n"
 
 
-def test_commands_are_judged() -> None:
-    """Zero stands, anything else moves, NaN and garbage are no commands; a header does not move."""
-    judge = Types().judge
+def test_commands_are_classified() -> None:
+    """Headers don't count."""
+    judge = Types().classify_command
     moving, nan, stamped = Twist(), Twist(), TwistStamped()
     moving.angular.z = -0.1
     nan.linear.x = float("nan")
     stamped.header.stamp.sec = 5
     stamped.header.frame_id = "base"
-    assert judge(TWIST, bytes(serialize_message(Twist()))) is Motion.STILL
-    assert judge(TWIST, bytes(serialize_message(moving))) is Motion.MOVING
-    assert judge(TWIST, bytes(serialize_message(nan))) is Motion.INVALID
-    assert judge(TWIST, b"garbage") is Motion.INVALID
-    assert judge(STAMPED, bytes(serialize_message(stamped))) is Motion.STILL
+    assert judge(TWIST, bytes(serialize_message(Twist()))) is CommandEffect.STILL
+    assert judge(TWIST, bytes(serialize_message(moving))) is CommandEffect.MOVING
+    assert judge(TWIST, bytes(serialize_message(nan))) is CommandEffect.INVALID
+    assert judge(TWIST, b"garbage") is CommandEffect.INVALID
+    assert judge(STAMPED, bytes(serialize_message(stamped))) is CommandEffect.STILL
 
 
-def test_a_stamped_command_is_judged_like_a_plain_one() -> None:
-    """Its header may be any; a number that is none is no command."""
+def test_stamped_commands_are_classified_like_plain_ones() -> None:
     moving, nan = TwistStamped(), TwistStamped()
     moving.header.frame_id = nan.header.frame_id = "base_link"
     moving.twist.linear.y = 0.1
     nan.twist.angular.x = float("inf")
-    judge = Types().judge
-    assert judge(STAMPED, bytes(serialize_message(moving))) is Motion.MOVING
-    assert judge(STAMPED, bytes(serialize_message(nan))) is Motion.INVALID
-    assert judge(STAMPED, bytes(serialize_message(moving))[:-8]) is Motion.INVALID
+    judge = Types().classify_command
+    assert judge(STAMPED, bytes(serialize_message(moving))) is CommandEffect.MOVING
+    assert judge(STAMPED, bytes(serialize_message(nan))) is CommandEffect.INVALID
+    assert judge(STAMPED, bytes(serialize_message(moving))[:-8]) is CommandEffect.INVALID
 
 
-def test_a_joystick_rests_with_as_many_axes_and_buttons() -> None:
-    """Whatever is pressed moves; zero has all of it let go, and the stamp of now."""
+def test_zero_of_a_joystick_has_as_many_axes_and_buttons() -> None:
     types = Types()
     joy = Joy(axes=[0.0, 0.5], buttons=[0, 1, 0])
     joy.header.frame_id = "pad"
     body = bytes(serialize_message(joy))
-    assert types.judge(JOY, body) is Motion.MOVING
-    zero = types.zero(JOY, Time(sec=9), types.resting(JOY, body))
-    assert types.judge(JOY, zero) is Motion.STILL
+    assert types.classify_command(JOY, body) is CommandEffect.MOVING
+    zero = types.zero_command(JOY, Time(sec=9), types.zero_template(JOY, body))
+    assert types.classify_command(JOY, zero) is CommandEffect.STILL
     said = deserialize_message(zero, Joy)
     assert (list(said.axes), list(said.buttons)) == ([0.0, 0.0], [0, 0, 0])
     assert (said.header.frame_id, said.header.stamp.sec) == ("pad", 9)
-    assert types.judge(JOY, bytes(serialize_message(Joy(axes=[float("nan")])))) is Motion.INVALID
-    assert types.judge(JOY, bytes(serialize_message(Joy(axes=[0.0], buttons=[1])))) is Motion.MOVING
+    assert (
+        types.classify_command(JOY, bytes(serialize_message(Joy(axes=[float("nan")]))))
+        is CommandEffect.INVALID
+    )
+    assert (
+        types.classify_command(JOY, bytes(serialize_message(Joy(axes=[0.0], buttons=[1]))))
+        is CommandEffect.MOVING
+    )
 
 
-def test_a_trajectory_moves_wherever_it_leads() -> None:
-    """Also to zero; one without points does not, and that is what follows it."""
+def test_trajectory_with_points_moves() -> None:
+    """Also to zero."""
     types = Types()
     way = JointTrajectory(joint_names=["a"], points=[JointTrajectoryPoint(positions=[0.0])])
     body = bytes(serialize_message(way))
-    assert types.judge(TRAJECTORY, body) is Motion.MOVING
-    zero = types.zero(TRAJECTORY, Time(), types.resting(TRAJECTORY, body))
-    assert types.judge(TRAJECTORY, zero) is Motion.STILL
+    assert types.classify_command(TRAJECTORY, body) is CommandEffect.MOVING
+    zero = types.zero_command(TRAJECTORY, Time(), types.zero_template(TRAJECTORY, body))
+    assert types.classify_command(TRAJECTORY, zero) is CommandEffect.STILL
     assert deserialize_message(zero, JointTrajectory).joint_names == ["a"]
     way.points[0].positions = [float("inf")]
-    assert types.judge(TRAJECTORY, bytes(serialize_message(way))) is Motion.INVALID
+    assert types.classify_command(TRAJECTORY, bytes(serialize_message(way))) is CommandEffect.INVALID
 
 
-def test_a_trajectory_of_bodies_moves_wherever_it_leads() -> None:
-    """As that of joints does, though no number in it is any but zero; none of them may be endless."""
+def test_multi_dof_trajectory_with_points_moves() -> None:
+    """Numbers must be finite."""
     types = Types()
     way = MultiDOFJointTrajectory(joint_names=["base"], points=[MultiDOFJointTrajectoryPoint()])
     way.header.frame_id = "map"
     body = bytes(serialize_message(way))
-    assert types.judge(MULTI_DOF, body) is Motion.MOVING
-    zero = types.zero(MULTI_DOF, Time(sec=9), types.resting(MULTI_DOF, body))
-    assert types.judge(MULTI_DOF, zero) is Motion.STILL
+    assert types.classify_command(MULTI_DOF, body) is CommandEffect.MOVING
+    zero = types.zero_command(MULTI_DOF, Time(sec=9), types.zero_template(MULTI_DOF, body))
+    assert types.classify_command(MULTI_DOF, zero) is CommandEffect.STILL
     said = deserialize_message(zero, MultiDOFJointTrajectory)
     assert (said.joint_names, list(said.points)) == (["base"], [])
     assert (said.header.frame_id, said.header.stamp.sec) == ("map", 9)
     way.points[0].velocities = [Twist(linear=Vector3(x=float("nan")))]
-    assert types.judge(MULTI_DOF, bytes(serialize_message(way))) is Motion.INVALID
+    assert types.classify_command(MULTI_DOF, bytes(serialize_message(way))) is CommandEffect.INVALID
     way.points[0].velocities = []
     way.points[0].transforms = [Transform(translation=Vector3(y=float("inf")))]
-    assert types.judge(MULTI_DOF, bytes(serialize_message(way))) is Motion.INVALID
+    assert types.classify_command(MULTI_DOF, bytes(serialize_message(way))) is CommandEffect.INVALID
 
 
-def test_zeros_of_a_velocity_are_all_alike() -> None:
-    """Nothing of the command is needed for them."""
-    assert Types().resting(TWIST, bytes(serialize_message(Twist()))) == b""
+def test_velocities_need_no_zero_template() -> None:
+    assert Types().zero_template(TWIST, bytes(serialize_message(Twist()))) == b""
 
 
-def test_interfaces_of_the_robot_are_known() -> None:
-    """All installed types are named, each with a definition: actions in three parts, with a hash."""
+def test_all_installed_types_have_definitions() -> None:
     types = Types()
     names = types.names()
     assert names == sorted(set(names))

@@ -38,9 +38,9 @@ def supply(folder: Path, **facts: str) -> Path:
     return folder
 
 
-def test_a_battery_that_counts_energy_is_read(tmp_path: Path) -> None:
-    """Energy becomes charge by the design's voltage, power becomes a current that is drained."""
-    state = battery.of_facts(battery.read(supply(tmp_path, **LAPTOP)))
+def test_energy_is_converted_to_charge(tmp_path: Path) -> None:
+    """By the design voltage; power becomes a current."""
+    state = battery.parse_facts(battery.read(supply(tmp_path, **LAPTOP)))
     assert state.volts == pytest.approx(11.4)
     assert state.amperes == pytest.approx(-2.0)
     assert state.celsius == pytest.approx(31.2)
@@ -49,26 +49,24 @@ def test_a_battery_that_counts_energy_is_read(tmp_path: Path) -> None:
     assert (state.status, state.health, state.technology, state.serial) == (2, 1, 2, "4711")
 
 
-def test_a_battery_that_counts_charge_is_read(tmp_path: Path) -> None:
-    """Its current is positive when it charges, whatever sign the driver gives; without a share one is computed."""
+def test_charge_and_sign_of_the_current_are_read(tmp_path: Path) -> None:
     facts = {"type": "Battery", "status": "Charging", "current_now": "-1500000"}
     facts |= {"charge_now": "1000000", "charge_full": "4000000"}
-    state = battery.of_facts(battery.read(supply(tmp_path, **facts)))
+    state = battery.parse_facts(battery.read(supply(tmp_path, **facts)))
     assert (state.amperes, state.charge, state.share) == pytest.approx((1.5, 1.0, 0.25))
     assert math.isnan(state.volts)
 
 
-def test_nonsense_in_files_is_not_known(tmp_path: Path) -> None:
-    """Text where a number should be, binary rubbish and a missing file are all unknown."""
+def test_invalid_and_missing_files_are_unknown(tmp_path: Path) -> None:
     folder = supply(tmp_path, type="Battery", capacity="full", status="?")
     (folder / "voltage_now").write_bytes(b"\xff" * 10_000)
-    state = battery.of_facts(battery.read(folder))
+    state = battery.parse_facts(battery.read(folder))
     assert math.isnan(state.share) and math.isnan(state.volts)
     assert state.status == 0
 
 
-def test_the_machines_battery_is_found_among_mice_and_mains(tmp_path: Path) -> None:
-    """Mains are no battery, and a mouse's is not the robot's; a folder of one battery is taken as it is."""
+def test_battery_of_the_machine_is_found(tmp_path: Path) -> None:
+    """Among mains and the batteries of mice."""
     supply(tmp_path / "AC", type="Mains")
     supply(tmp_path / "hid-mouse", type="Battery", scope="Device")
     ours = supply(tmp_path / "hid-system", type="Battery", scope="System")
@@ -76,8 +74,7 @@ def test_the_machines_battery_is_found_among_mice_and_mains(tmp_path: Path) -> N
     assert battery.supply(ours) == ours
 
 
-def test_without_a_battery_it_says_so(tmp_path: Path) -> None:
-    """Also when the folder isn't there."""
+def test_missing_battery_is_reported(tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match="there is no battery in"):
         battery.supply(tmp_path)
     with pytest.raises(Unavailable, match="No such file"):
@@ -94,13 +91,12 @@ def test_without_a_battery_it_says_so(tmp_path: Path) -> None:
         (ChargeState(share=57.0, volts=18.0), 0.0),
     ],
 )
-def test_the_charge_is_found_in_what_a_battery_tells(state: ChargeState, share: float) -> None:
-    """As it says, else by capacity, else by voltage; a share that is no share is none."""
+def test_charge_is_reported_or_from_capacity_or_voltage(state: ChargeState, share: float) -> None:
     assert Gauge(0.2, 0.1, (18.0, 24.0)).share(state) == pytest.approx(share)
 
 
-def test_it_warns_when_low_and_is_in_error_when_nearly_empty() -> None:
-    """And at a threshold it does not flicker."""
+def test_low_and_nearly_empty_batteries_are_reported() -> None:
+    """With hysteresis."""
     gauge = Gauge(0.2, 0.1)
     shares = (0.5, 0.19, 0.21, 0.09, 0.11, 0.125, 0.225)
     levels = [gauge.finding(ChargeState(share=each)).level for each in shares]
@@ -109,15 +105,13 @@ def test_it_warns_when_low_and_is_in_error_when_nearly_empty() -> None:
     assert gauge.finding(ChargeState(share=0.05)).message == "nearly empty: 5 %, charge it now"
 
 
-def test_what_charges_is_not_low() -> None:
-    """Whoever stands at the charger need not be told to go there."""
+def test_charging_battery_is_not_low() -> None:
     assert Gauge(0.2, 0.1).finding(ChargeState(share=0.05, status=CHARGING)).level is Level.OK
 
 
-def test_a_battery_in_trouble_is_an_error() -> None:
-    """Overheated, gone, or unknown: each in its words."""
+def test_faulty_missing_and_unknown_batteries_are_reported() -> None:
     gauge = Gauge(0.2, 0.1)
     hot = gauge.finding(ChargeState(share=0.9, health=battery.HEALTH["Overheat"]))
-    assert (hot.level, hot.message) == (Level.ERROR, "the battery tells: overheat")
+    assert (hot.level, hot.message) == (Level.ERROR, "the battery reports: overheat")
     assert gauge.finding(ChargeState(present=False)).level is Level.ERROR
     assert gauge.finding(ChargeState()).level is Level.WARN

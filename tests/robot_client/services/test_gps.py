@@ -1,4 +1,4 @@
-"""Positions from NMEA sentences, and where those come from."""
+"""Positions from NMEA sentences, and the sources of those."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from switchboard_waiting import wait_for
 
 from relay_protocol.errors import Invalid, Unavailable
 from robot_client.services.gps import APPROXIMATED, LONGEST, NO_FIX, SBAS_FIX, Lines, Nmea
-from robot_client.services.gps_source import ByteReader, FileSource, opener
+from robot_client.services.gps_source import ByteReader, FileSource, source_factory
 from robot_client.services.health import Level
+from tests.worlds.waiting import wait_for
 
 
 def sentence(body: str) -> bytes:
-    """With its sum."""
+    """Add the checksum."""
     return f"${body}*{reduce(lambda total, each: total ^ each, body.encode(), 0):02X}".encode()
 
 
 GGA = sentence("GPGGA,123519.00,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,")
 
 
-def test_a_fix_is_read() -> None:
-    """Degrees, height over the ellipsoid, and what a dilution of 0.9 stands for."""
+def test_fix_is_read() -> None:
     fix = Nmea().read(GGA)
     assert fix is not None
     assert (fix.latitude, fix.longitude) == pytest.approx((48.1173, 11.516667), abs=1e-6)
@@ -38,8 +37,7 @@ def test_a_fix_is_read() -> None:
     assert fix.variances == pytest.approx((12.96, 12.96, 51.84))
 
 
-def test_south_and_west_are_negative_and_a_better_fix_is_surer() -> None:
-    """A differential fix of several systems, after one was heard by its own name."""
+def test_signs_and_variances_of_a_fix() -> None:
     nmea = Nmea()
     nmea.read(sentence("GAGSV,1,1,00"))
     fix = nmea.read(sentence("GNGGA,000000,3351.500,S,15112.500,W,2,12,1.0,10.0,M,,M,,"))
@@ -51,8 +49,8 @@ def test_south_and_west_are_negative_and_a_better_fix_is_surer() -> None:
 
 
 @pytest.mark.parametrize("quality", ["0", "6", "7", "8", ""])
-def test_without_a_fix_there_are_no_coordinates(quality: str) -> None:
-    """Also when a receiver repeats its last position, estimates one or simulates."""
+def test_no_coordinates_without_a_fix(quality: str) -> None:
+    """Estimated and simulated positions count as none."""
     fix = Nmea().read(sentence(f"GPGGA,123519,4807.038,N,01131.000,E,{quality},00,,,M,,M,,"))
     assert fix is not None
     assert fix.status == NO_FIX
@@ -74,8 +72,8 @@ def test_without_a_fix_there_are_no_coordinates(quality: str) -> None:
         sentence("GPGGA,1"),
     ],
 )
-def test_a_bad_sentence_is_counted_and_the_next_is_read(bad: bytes) -> None:
-    """A wrong sum, noise, half a sentence, fields that make no sense."""
+def test_bad_sentences_are_counted(bad: bytes) -> None:
+    """The next is read."""
     nmea = Nmea()
     nmea.read(bad)
     assert nmea.read(GGA) is not None
@@ -83,29 +81,26 @@ def test_a_bad_sentence_is_counted_and_the_next_is_read(bad: bytes) -> None:
     assert nmea.last is not None and nmea.last.variances is not None
 
 
-def test_a_wrong_sum_counts_as_bad() -> None:
-    """One of each."""
+def test_wrong_checksum_counts_as_bad() -> None:
     nmea = Nmea()
     assert nmea.read(GGA[:-1] + b"0") is None
     assert (nmea.good, nmea.bad) == (0, 1)
 
 
-def test_other_sentences_are_good_but_no_fix() -> None:
-    """Known and unknown kinds."""
+def test_other_sentences_give_no_fix() -> None:
     nmea = Nmea()
     assert nmea.read(sentence("GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W")) is None
     assert nmea.read(sentence("GPXYZ,1,2")) is None
     assert (nmea.good, nmea.bad) == (2, 0)
 
 
-def test_a_sentence_after_a_cut_one_on_the_same_line_is_read() -> None:
-    """As after a byte that was lost with a line's end."""
+def test_sentence_after_a_truncated_one_is_read() -> None:
+    """On the same line."""
     assert Nmea().read(GGA[:20] + GGA) is not None
 
 
 @given(st.binary(max_size=100))
-def test_no_bytes_break_it(noise: bytes) -> None:
-    """Whatever comes, the next sentence is read."""
+def test_any_bytes_are_survived(noise: bytes) -> None:
     nmea = Nmea()
     nmea.read(noise)
     nmea.read(b"$" + noise)
@@ -113,8 +108,7 @@ def test_no_bytes_break_it(noise: bytes) -> None:
 
 
 @given(st.lists(st.integers(0, 120), max_size=6))
-def test_lines_do_not_depend_on_how_bytes_come(cuts: list[int]) -> None:
-    """In whichever pieces, the same lines."""
+def test_lines_do_not_depend_on_the_pieces(cuts: list[int]) -> None:
     data = GGA + b"\r\n\r\n" + GGA + b"\nrest"
     lines = Lines()
     found: list[bytes] = []
@@ -125,18 +119,17 @@ def test_lines_do_not_depend_on_how_bytes_come(cuts: list[int]) -> None:
     assert found == [GGA, GGA]
 
 
-def test_what_is_too_long_for_a_line_is_thrown_away() -> None:
-    """It is counted once, memory stays bounded, and the next line is whole."""
+def test_too_long_lines_are_discarded_and_counted() -> None:
     lines = Lines()
     for _ in range(100):
         assert list(lines.feed(b"x" * LONGEST)) == []
     assert list(lines.feed(b"end\n" + GGA + b"\n")) == [GGA]
     assert lines.too_long == 1
-    assert len(lines._rest) <= LONGEST
+    assert len(lines._unfinished) <= LONGEST
 
 
-def test_the_recording_of_the_documentation_is_a_round_with_a_tunnel() -> None:
-    """All of its sentences are good; it leaves the sky once, and ends near where it began."""
+def test_documented_recording_is_valid() -> None:
+    """A closed route with one loss of the fix."""
     lines, nmea = Lines(), Nmea()
     data = Path(__file__).parents[3].joinpath("docs/examples/drive.nmea").read_bytes()
     fixes = [fix for line in lines.feed(data) if (fix := nmea.read(line))]
@@ -145,10 +138,9 @@ def test_the_recording_of_the_documentation_is_a_round_with_a_tunnel() -> None:
     assert abs(fixes[0].latitude - fixes[-1].latitude) < 1e-4
 
 
-def test_the_finding_tells_how_good_it_is() -> None:
-    """Nothing heard, no fix, a fix with its sigma."""
+def test_finding_has_the_quality_of_the_fix() -> None:
     nmea = Nmea()
-    assert nmea.finding().message == "no position was heard yet"
+    assert nmea.finding().message == "no position was received yet"
     nmea.read(sentence("GPGGA,123519,,,,,0,00,,,M,,M,,"))
     assert nmea.finding().message == "the receiver has no fix"
     nmea.read(GGA)
@@ -160,20 +152,17 @@ def test_the_finding_tells_how_good_it_is() -> None:
 
 
 @pytest.mark.parametrize("bad", ["tcp://host", "tcp://:1", "tcp://host:0", "tcp://host:99999", "tcp://a:b:1"])
-def test_an_address_that_is_none_is_refused(bad: str) -> None:
-    """In words, before anything is opened."""
+def test_invalid_address_is_refused(bad: str) -> None:
     with pytest.raises(Invalid):
-        opener(bad, 9600, 1.0)
+        source_factory(bad, 9600, 1.0)
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
-    """In words."""
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match="No such file"):
-        opener(str(tmp_path / "none"), 9600, 1.0)
+        source_factory(str(tmp_path / "none"), 9600, 1.0)
 
 
-def test_a_recording_has_its_pace(tmp_path: Path) -> None:
-    """It waits before each position, and ends."""
+def test_recording_is_replayed_at_its_pace(tmp_path: Path) -> None:
     file = tmp_path / "drive.nmea"
     file.write_bytes(GGA + b"\n" + sentence("GPXYZ,1") + b"\n" + GGA + b"\n")
     waited: list[float] = []
@@ -185,12 +174,11 @@ def test_a_recording_has_its_pace(tmp_path: Path) -> None:
     assert waited == [0.5, 0.5]
 
 
-def test_a_server_that_hangs_up_is_dialled_again() -> None:
-    """What it sends comes, also from the second connection."""
+def test_lost_server_is_connected_again() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         came: list[bytes] = []
         reader = ByteReader(
-            "test", opener(f"tcp://127.0.0.1:{server.getsockname()[1]}", 9600, 1.0), came.append
+            "test", source_factory(f"tcp://127.0.0.1:{server.getsockname()[1]}", 9600, 1.0), came.append
         )
         try:
             for word in (b"one", b"two"):
@@ -203,11 +191,11 @@ def test_a_server_that_hangs_up_is_dialled_again() -> None:
             reader.close()
 
 
-def test_a_serial_device_is_read_and_found_again() -> None:
-    """A terminal is set raw, so that nothing is translated; one that is gone is an error in words."""
+def test_lost_serial_device_is_opened_again() -> None:
+    """It is set to raw mode."""
     master, slave = os.openpty()
     came: list[bytes] = []
-    reader = ByteReader("the receiver", opener(os.ttyname(slave), 4800, 1.0), came.append)
+    reader = ByteReader("the receiver", source_factory(os.ttyname(slave), 4800, 1.0), came.append)
     try:
         wait_for(
             "it is read",
@@ -215,8 +203,8 @@ def test_a_serial_device_is_read_and_found_again() -> None:
         )
         os.close(slave)
         os.close(master)
-        trouble = wait_for("the loss", reader.finding)
-        assert trouble.level is Level.ERROR and trouble.message.startswith("the receiver: ")
+        problem = wait_for("the loss", reader.finding)
+        assert problem.level is Level.ERROR and problem.message.startswith("the receiver: ")
     finally:
         reader.close()
     assert "gps-source" not in {each.name for each in threading.enumerate()}

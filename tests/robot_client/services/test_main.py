@@ -1,4 +1,4 @@
-"""What the command of the services says about itself."""
+"""The help text and errors of the services' command."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from robot_client.services.main import COMMAND, main
 
 
 @pytest.mark.parametrize("name", sorted(main.commands))
-def test_help_ends_with_examples_that_are_understood(name: str) -> None:
-    """Each line is a command as it is typed, with options that exist."""
+def test_examples_in_help_texts_are_valid_commands(name: str) -> None:
     shown = CliRunner().invoke(main, [name, "--help"], prog_name=COMMAND)
     assert shown.exit_code == 0
     _, found, lines = shown.output.partition("Examples:\n")
@@ -24,25 +23,25 @@ def test_help_ends_with_examples_that_are_understood(name: str) -> None:
 
 
 def test_all_services_are_listed() -> None:
-    """Each with a sentence."""
     shown = CliRunner().invoke(main, ["--help"])
-    for name in ("battery", "faces", "gps", "markers", "obstacles", "speech"):
+    for name in ("battery", "faces", "gps", "markers", "navigator", "obstacles", "speech"):
         assert f"\n  {name} " in shown.output
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["obstacles", "--low", "2"], "--low (2) must be less than --high (1.5)"),
         (["battery", "--critical", "30"], "--critical (30) must not be more than --low (20)"),
         (["gps", "x", "--baud", "1"], "'1' is not one of"),
-        (["faces", "--alike", "2"], "--alike"),
+        (["faces", "--similarity", "2"], "--similarity"),
+        (["navigator", "--scan", "", "--depth", ""], "a navigator needs a sensor"),
+        (["navigator", "--inflation", "0.1"], "--inflation (0.1) must not be less than --radius (0.2)"),
         (["markers"], "Missing option '--size'"),
-        (["markers", "--size", "0.1", "--dictionary", "9X9"], "'9X9' is not known; these are: 4X4_50"),
+        (["markers", "--size", "0.1", "--dictionary", "9X9"], "'9X9' is not a dictionary; known are: 4X4_50"),
     ],
 )
-def test_options_that_make_no_sense_are_told_in_a_sentence(words: list[str], told: str) -> None:
-    """Before anything runs."""
+def test_invalid_options_are_reported(words: list[str], reported: str) -> None:
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 2
-    assert told in done.output
+    assert reported in done.output

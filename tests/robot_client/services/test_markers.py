@@ -1,4 +1,4 @@
-"""Markers in drawn pictures."""
+"""Markers in drawn images."""
 
 from __future__ import annotations
 
@@ -20,15 +20,12 @@ def drawn(
     number: int,
     at: tuple[float, float, float],
     turn: float = 0.0,
-    lens: CameraModel = LENS,
+    model: CameraModel = LENS,
     onto: Pixels | None = None,
     dictionary: str = "4X4_50",
 ) -> Pixels:
-    """A picture of a marker as a camera would take it, by projecting its corners.
-
-    :param at: its middle, metres to the right, down and ahead
-    :param turn: radians about the vertical
-    """
+    """Draw a marker as a camera would see it. :param at: its middle, metres to the right, down and ahead :param
+    turn: radians about the vertical"""
     family = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
     side, edge = 240, 60
     texture = cv2.copyMakeBorder(
@@ -46,7 +43,7 @@ def drawn(
     x, y, z = (corners @ turned.T + np.array(at)).T
     # Drawn larger and made smaller, so that edges are as smooth as a camera's.
     large = 4
-    fine = lens.scaled(large)
+    fine = model.scaled(large)
     pixels = np.stack((fine.fx * x / z + fine.cx, fine.fy * y / z + fine.cy), axis=1).astype(np.float32)
     whole = side + 2 * edge
     # Edges of the texture, not the middles of its outer pixels.
@@ -62,8 +59,7 @@ def drawn(
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.8), (0.3, -0.1, 1.5), (-0.9, 0.2, 2.0)])
-def test_a_marker_is_found_where_it_is(at: tuple[float, float, float]) -> None:
-    """Number, distance within two per cent and bearing within half a degree."""
+def test_marker_is_found_at_its_position(at: tuple[float, float, float]) -> None:
     (seen,) = Detector("4X4_50", SIZE).find(drawn(7, at), LENS)
     assert seen.number == 7
     assert seen.distance == pytest.approx(math.hypot(*at), rel=0.02)
@@ -71,8 +67,7 @@ def test_a_marker_is_found_where_it_is(at: tuple[float, float, float]) -> None:
 
 
 @pytest.mark.parametrize("turn", [-0.8, 0.5])
-def test_a_marker_that_is_turned_is_found_turned(turn: float) -> None:
-    """Its axis z, out of the marker, points where it looks; the distance is right all the same."""
+def test_orientation_of_a_marker_is_found(turn: float) -> None:
     (seen,) = Detector("4X4_50", SIZE).find(drawn(3, (0.1, 0.0, 0.8), turn), LENS)
     assert seen.distance == pytest.approx(math.hypot(0.1, 0.8), rel=0.02)
     x, y, z, w = seen.orientation
@@ -80,8 +75,8 @@ def test_a_marker_that_is_turned_is_found_turned(turn: float) -> None:
     assert out == pytest.approx((-math.sin(turn), 0.0, -math.cos(turn)), abs=0.06)
 
 
-def test_several_are_found_in_colour_by_their_numbers() -> None:
-    """In the order of their numbers; of two with the same number the nearer counts."""
+def test_several_markers_are_sorted_by_number() -> None:
+    """Of two with one number the nearer counts."""
     picture = drawn(9, (-0.5, 0.0, 1.2))
     picture = drawn(2, (0.5, 0.0, 1.2), onto=picture)
     picture = drawn(9, (0.0, 0.2, 0.9), onto=picture)
@@ -90,8 +85,7 @@ def test_several_are_found_in_colour_by_their_numbers() -> None:
     assert found[1].distance == pytest.approx(math.hypot(0.2, 0.9), rel=0.02)
 
 
-def test_nothing_is_found_where_nothing_is() -> None:
-    """An empty picture, noise, and markers of another family."""
+def test_no_marker_is_found_in_other_images() -> None:
     detector = Detector("4X4_50", SIZE)
     noise = np.random.default_rng(1).integers(0, 255, (480, 640), np.uint8)
     other = drawn(7, (0.0, 0.0, 0.8), dictionary="APRILTAG_36h11")
@@ -99,10 +93,9 @@ def test_nothing_is_found_where_nothing_is() -> None:
         assert detector.find(picture, LENS) == []
 
 
-def test_distortion_is_taken_out() -> None:
-    """A lens that bends: the marker is drawn through it, and found where it is."""
+def test_distortion_is_corrected() -> None:
     bent = CameraModel(400.0, 400.0, 319.5, 239.5, (-0.25, 0.05, 0.0, 0.0, 0.0))
-    flat = drawn(5, (0.45, 0.25, 1.0), lens=bent)
+    flat = drawn(5, (0.45, 0.25, 1.0), model=bent)
     matrix = np.array([[400.0, 0, 319.5], [0, 400.0, 239.5], [0, 0, 1]])
     rows, columns = np.mgrid[0:480, 0:640].astype(np.float32)
     points = np.stack((columns.ravel(), rows.ravel()), axis=1)[:, None, :]
@@ -118,12 +111,10 @@ def test_distortion_is_taken_out() -> None:
 
 
 @pytest.mark.parametrize("name", DICTIONARIES)
-def test_each_family_that_is_offered_is_there(name: str) -> None:
-    """OpenCV has them all."""
+def test_all_dictionaries_exist(name: str) -> None:
     assert Detector(name, SIZE).find(np.zeros((48, 64), np.uint8), LENS) == []
 
 
-def test_a_quarter_turn_as_a_quaternion() -> None:
-    """About z, and no turn at all."""
+def test_quaternion_of_a_quarter_turn() -> None:
     assert quaternion(np.array([0.0, 0.0, math.pi / 2])) == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
     assert quaternion(np.zeros(3)) == (0.0, 0.0, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What is nearest in each direction."""
+"""The nearest obstacle in each direction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from relay_protocol.errors import Invalid
-from robot_client.camera.messages import Image
+from robot_client.camera.images import ImageMessage
 from robot_client.services import obstacles
 from robot_client.services.camera_model import of_view
 from robot_client.services.health import Level
@@ -23,15 +23,14 @@ def scan(ranges: list[float], begin: float, step: float) -> Scan:
 
 
 def turn(**at: float) -> Scan:
-    """A whole turn of 360 rays from straight behind; what is met by degree."""
+    """A full-circle scan of 360 rays that begins straight behind."""
     ranges = [math.inf] * 360
     for degree, distance in at.items():
         ranges[(int(degree.replace("m", "-").lstrip("d")) + 180) % 360] = distance
     return scan(ranges, -math.pi, math.radians(1))
 
 
-def test_of_a_whole_turn_a_sector_lies_straight_ahead() -> None:
-    """What is 10 degrees to either side is in the sector in the middle, and so is the exact bearing."""
+def test_full_circle_has_a_sector_straight_ahead() -> None:
     found = obstacles.of_scan(turn(d10=2.0, dm10=3.0, d90=4.0), 12)
     assert found.first + 6 * found.width == pytest.approx(0.0)
     assert found.places[6] == (2.0, pytest.approx(math.radians(10)))
@@ -40,15 +39,13 @@ def test_of_a_whole_turn_a_sector_lies_straight_ahead() -> None:
     assert found.nearest == found.places[6]
 
 
-def test_what_is_behind_is_one_sector_across_the_end_of_the_scan() -> None:
-    """The first sector is straight behind, on both sides of where the turn begins."""
+def test_full_circle_has_a_sector_straight_behind() -> None:
     found = obstacles.of_scan(turn(d170=2.0, dm170=1.5), 12)
     assert found.places[0] == (1.5, pytest.approx(math.radians(-170)))
     assert found.places[1:] == (None,) * 11
 
 
-def test_less_than_a_turn_is_divided_evenly() -> None:
-    """Three sectors of 90 degrees are 30 each, the first to the right."""
+def test_smaller_field_of_view_is_divided_evenly() -> None:
     ranges = [math.inf] * 90
     ranges[5], ranges[85] = 1.0, 2.0
     found = obstacles.of_scan(scan(ranges, math.radians(-44.5), math.radians(1)), 3)
@@ -57,31 +54,28 @@ def test_less_than_a_turn_is_divided_evenly() -> None:
     assert [each and each.distance for each in found.places] == [1.0, None, 2.0]
 
 
-def test_a_scanner_that_turns_clockwise_is_read_the_other_way_round() -> None:
-    """Its first ray is the leftmost."""
+def test_clockwise_scans_are_read() -> None:
     ranges = [1.0] + [math.inf] * 89
     found = obstacles.of_scan(scan(ranges, math.radians(44.5), -math.radians(1)), 3)
     assert [each and each.distance for each in found.places] == [None, None, 1.0]
 
 
-def test_what_was_not_measured_is_nothing() -> None:
-    """Too far, infinite, zero and NaN are no obstacles, nor is a distance below zero."""
+def test_unmeasured_ranges_are_no_obstacles() -> None:
     found = obstacles.of_scan(scan([11.0, math.inf, 0.0, math.nan, -1.0, math.inf], 0.0, 0.1), 2)
     assert found.places == (None, None)
     assert found.nearest is None
 
 
 @pytest.mark.parametrize("ray", [-math.inf, 0.05])
-def test_what_is_too_near_to_be_measured_is_as_near_as_can_be(ray: float) -> None:
-    """It is an obstacle at the least distance, at its bearing, and nearer than all that was measured."""
+def test_too_near_ranges_count_as_the_least_range(ray: float) -> None:
     found = obstacles.of_scan(scan([2.0, ray, 3.0, math.nan], 0.0, 0.1), 1)
     assert found.nearest == (0.1, pytest.approx(0.1))
 
 
 @pytest.mark.parametrize("ray", [math.nan, 0.0, -1.0])
-def test_a_scan_without_any_measurement_is_refused(ray: float) -> None:
-    """It does not say that nothing is there; one ray into the distance does."""
-    with pytest.raises(Invalid, match="not one of the 90 rays"):
+def test_scan_without_measurements_is_refused(ray: float) -> None:
+    """One ray without a hit is a measurement."""
+    with pytest.raises(Invalid, match="none of the 90 rays"):
         obstacles.of_scan(scan([ray] * 90, 0.0, 0.01), 4)
     for far in (math.inf, 11.0):
         assert obstacles.of_scan(scan([ray] * 89 + [far], 0.0, 0.01), 4).nearest is None
@@ -100,8 +94,7 @@ def test_a_scan_without_any_measurement_is_refused(ray: float) -> None:
         scan([1.0], 0.0, 0.1)._replace(least=-1.0),
     ],
 )
-def test_a_scan_that_makes_no_sense_is_refused(bad: Scan) -> None:
-    """In words, not by a crash."""
+def test_invalid_scans_are_refused(bad: Scan) -> None:
     with pytest.raises(Invalid):
         obstacles.of_scan(bad, 4)
 
@@ -110,8 +103,7 @@ def wall(distance: float) -> np.ndarray:
     return np.full((120, 160), distance, np.float32)
 
 
-def test_a_wall_of_depth_is_as_near_in_the_middle_and_farther_aside() -> None:
-    """Depth is along the axis; what counts is the distance."""
+def test_distance_is_along_the_floor_not_along_the_axis() -> None:
     found = obstacles.of_depth(wall(2.0), LENS, 3, Band())
     assert found.places[1] is not None and found.places[1].distance == pytest.approx(2.0, rel=0.01)
     outer = [each for each in (found.places[0], found.places[2]) if each]
@@ -121,8 +113,7 @@ def test_a_wall_of_depth_is_as_near_in_the_middle_and_farther_aside() -> None:
     assert outer[0].bearing < 0 < outer[1].bearing
 
 
-def test_a_post_to_the_left_of_a_picture_has_a_bearing_to_the_left() -> None:
-    """It is where the lens says, and all other sectors are empty."""
+def test_bearing_of_an_obstacle_in_a_depth_image() -> None:
     depth = np.full((120, 160), np.nan, np.float32)
     depth[:, 20:30] = 1.5
     found = obstacles.of_depth(depth, LENS, 5, Band())
@@ -134,8 +125,8 @@ def test_a_post_to_the_left_of_a_picture_has_a_bearing_to_the_left() -> None:
     assert nearest.distance == pytest.approx(1.5 / math.cos(at), rel=0.01)
 
 
-def test_the_floor_is_no_obstacle_and_what_stands_on_it_is() -> None:
-    """A camera 0.2 m over the floor sees the floor below its horizon, and a box of 0.1 m before it."""
+def test_floor_is_no_obstacle() -> None:
+    """A box on it is one."""
     rows = np.arange(120)
     with np.errstate(divide="ignore"):
         floor = np.where(rows > LENS.cy, 0.2 * LENS.fy / (rows - LENS.cy), np.inf)
@@ -148,15 +139,14 @@ def test_the_floor_is_no_obstacle_and_what_stands_on_it_is() -> None:
 
 
 def test_a_few_pixels_of_noise_are_no_obstacle() -> None:
-    """Single pixels that are near do not count; the wall behind them does."""
     depth = wall(3.0)
     depth[60, :19] = 0.3
     found = obstacles.of_depth(depth, LENS, 1, Band()).nearest
     assert found is not None and found.distance > 2.9
 
 
-def test_depth_too_near_to_be_measured_is_an_obstacle_before_the_camera() -> None:
-    """No metres away, in its sector; unless the camera looks out over all that is in the robot's way."""
+def test_too_near_depth_is_an_obstacle_at_the_camera() -> None:
+    """Unless the camera is above all obstacles."""
     depth = wall(3.0)
     depth[10:20, 140:] = -math.inf
     right, middle, left = obstacles.of_depth(depth, LENS, 3, Band()).places
@@ -167,8 +157,7 @@ def test_depth_too_near_to_be_measured_is_an_obstacle_before_the_camera() -> Non
 
 
 @pytest.mark.parametrize("pixel", [math.nan, 0.0, -1.0])
-def test_a_picture_without_any_depth_is_refused(pixel: float) -> None:
-    """It does not say that nothing is there, nor do a few pixels of noise; as many far ones as agree do."""
+def test_depth_image_without_measurements_is_refused(pixel: float) -> None:
     depth = wall(pixel)
     depth[60, :19] = math.inf
     with pytest.raises(Invalid, match="fewer than 20 pixels of the 160×120"):
@@ -185,50 +174,44 @@ def test_a_picture_without_any_depth_is_refused(pixel: float) -> None:
     ],
 )
 def test_depth_is_read_from_both_encodings(encoding: str, data: bytes, expected: list[float]) -> None:
-    """Millimetres and metres; zero millimetres were not measured."""
-    picture = Image(encoding, 2, 2, False, len(data) // 2, memoryview(data))
+    picture = ImageMessage(encoding, 2, 2, False, len(data) // 2, memoryview(data))
     np.testing.assert_allclose(obstacles.metres(picture).ravel(), expected)
 
 
 def test_big_endian_rows_with_padding_are_read() -> None:
-    """What pads a row is stepped over."""
     data = struct.pack(">3H", 1000, 2000, 9) + struct.pack(">3H", 3000, 4000, 9)
-    picture = Image("16UC1", 2, 2, True, 6, memoryview(data))
+    picture = ImageMessage("16UC1", 2, 2, True, 6, memoryview(data))
     assert obstacles.metres(picture).tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
 @pytest.mark.parametrize(
     "picture",
     [
-        Image("rgb8", 1, 1, False, 3, memoryview(b"abc")),
-        Image("16UC1", 2, 2, False, 2, memoryview(b"abcdefgh")),
-        Image("32FC1", 2, 2, False, 8, memoryview(b"abcdefgh")),
+        ImageMessage("rgb8", 1, 1, False, 3, memoryview(b"abc")),
+        ImageMessage("16UC1", 2, 2, False, 2, memoryview(b"abcdefgh")),
+        ImageMessage("32FC1", 2, 2, False, 8, memoryview(b"abcdefgh")),
     ],
 )
-def test_a_picture_without_depth_or_too_small_is_refused(picture: Image) -> None:
-    """In words."""
+def test_other_encodings_and_short_images_are_refused(picture: ImageMessage) -> None:
     with pytest.raises(Invalid):
         obstacles.metres(picture)
 
 
-def test_nearness_does_not_flicker() -> None:
-    """It begins below the threshold and ends a tenth above it."""
+def test_proximity_has_hysteresis() -> None:
     near = ProximityAlarm(1.0)
-    seen = [near.see(ObstaclePosition(distance, 0.0)) for distance in (1.2, 0.99, 1.05, 0.98, 1.11)]
+    seen = [near.update(ObstaclePosition(distance, 0.0)) for distance in (1.2, 0.99, 1.05, 0.98, 1.11)]
     assert seen == [False, True, False, False, True]
     assert not near.near
-    assert near.see(ObstaclePosition(0.5, 0.0)) and near.see(None)
+    assert near.update(ObstaclePosition(0.5, 0.0)) and near.update(None)
 
 
-def test_what_is_as_near_as_can_be_measured_is_near_below_any_threshold() -> None:
-    """A scanner that measures from 0.6 m can't tell whether it is 0.5 m away, so it may be."""
+def test_least_range_of_the_sensor_always_counts_as_near() -> None:
     near = ProximityAlarm(0.5)
-    assert not near.see(ObstaclePosition(0.61, 0.0), 0.6)
-    assert near.see(ObstaclePosition(0.6, 0.0), 0.6) and near.near
+    assert not near.update(ObstaclePosition(0.61, 0.0), 0.6)
+    assert near.update(ObstaclePosition(0.6, 0.0), 0.6) and near.near
 
 
-def test_the_finding_says_where() -> None:
-    """A warning when it is near, with distance and side."""
+def test_finding_has_distance_and_side() -> None:
     found = obstacles.finding(True, ObstaclePosition(0.32, math.radians(-30)))
     assert (found.level, found.message) == (Level.WARN, "an obstacle is near: 0.32 m away, 30° to the right")
     assert obstacles.finding(False, None).level is Level.OK

@@ -21,17 +21,17 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, LaserScan, NavSatFix
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
-from switchboard_domains import free_domain
-from switchboard_forks import run_command
 from visualization_msgs.msg import MarkerArray
 
 from robot_client.services.main import COMMAND
 from robot_client.sim.camera import to_jpeg
-from tests.robot_client.services.onlooker import Onlooker, service
-from tests.robot_client.services.pictures_of_people import EILEEN, people, scene
 from tests.robot_client.services.test_battery import LAPTOP, supply
 from tests.robot_client.services.test_gps import sentence
 from tests.robot_client.services.test_markers import LENS, SIZE, drawn
+from tests.worlds.face_images import EILEEN, people, scene
+from tests.worlds.forked_programs import run_command
+from tests.worlds.ros_domains import free_domain
+from tests.worlds.service_process import TopicWatcher, service
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -42,9 +42,9 @@ def domain() -> int:
 
 
 @pytest.fixture
-def onlooker(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Onlooker]:
+def onlooker(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[TopicWatcher]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    onlooker = Onlooker(domain)
+    onlooker = TopicWatcher(domain)
     onlooker.watch_health()
     yield onlooker
     onlooker.close()
@@ -55,7 +55,7 @@ def level(wanted: bytes) -> Any:
 
 
 def repeated(action: Callable[[], object], seconds: float) -> Callable[[], None]:
-    """The same action, done at most so often."""
+    """The same action, at most so often."""
     last = -math.inf
 
     def act() -> None:
@@ -75,8 +75,8 @@ def picture(pixels: np.ndarray, encoding: str, frame: str) -> Image:
     return message
 
 
-def test_obstacles_of_a_scan(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """A post ahead to the left is in its sector, exactly in its place, and too near; gone, it is clear."""
+def test_obstacles_of_a_scan(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
+    """An obstacle is in its sector; without it, the sector is clear."""
     onlooker.watch("/r1/obstacles", LaserScan)
     onlooker.watch("/r1/obstacles/places", PoseArray)
     onlooker.watch("/r1/obstacles/near", Bool, LATCHED)
@@ -107,15 +107,15 @@ def test_obstacles_of_a_scan(onlooker: Onlooker, domain: int, tmp_path: Path) ->
         )
         scan.ranges = [math.nan] * 360
         blind = onlooker.health("r1/obstacles", level(DiagnosticStatus.ERROR), **say).message
-        assert blind == "not one of the 360 rays of the scan has measured anything"
+        assert blind == "none of the 360 rays of the scan has a measurement"
         assert near == []
         scan.ranges = [math.inf] * 360
         scan.ranges[180 + 20] = 2.0
         onlooker.newest("/r1/obstacles/near", lambda each: not each.data, **say)
 
 
-def test_obstacles_of_depth(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """A picture of depth with its CameraInfo gives the same, in a frame that looks ahead; one without depth nothing."""
+def test_obstacles_of_depth(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
+    """Of a depth image with its CameraInfo; an image without depth gives none."""
     onlooker.watch("/obstacles", LaserScan)
     onlooker.watch("/obstacles/near", Bool, LATCHED)
     depth = onlooker.node.create_publisher(Image, "/depth/image", qos_profile_sensor_data)
@@ -137,7 +137,7 @@ def test_obstacles_of_depth(onlooker: Onlooker, domain: int, tmp_path: Path) -> 
         message.data = picture(np.full((48, 64), 300, np.uint16), "16UC1", "").data
         onlooker.until("near", lambda: [each.data for each in near][-1:] == [True], publish)
         message.data = picture(np.zeros((48, 64), np.uint16), "16UC1", "").data
-        blind = "fewer than 20 pixels of the 64×48 of depth have measured anything"
+        blind = "fewer than 20 pixels of the 64×48 depth image have a measurement"
         said = onlooker.health("obstacles", lambda status: status.message == blind, publish)
         assert said.level == DiagnosticStatus.ERROR and near[-1].data
         message.encoding = "rgb8"
@@ -148,8 +148,7 @@ def test_obstacles_of_depth(onlooker: Onlooker, domain: int, tmp_path: Path) -> 
         )
 
 
-def test_battery_of_this_machine(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """What Linux tells is published; when the charge falls it is told, and when the battery is taken out."""
+def test_battery_of_this_machine(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
     onlooker.watch("/battery_state", BatteryState)
     folder = supply(tmp_path / "supplies" / "BAT0", **LAPTOP)
     with service(domain, tmp_path, "battery", "--folder", str(folder.parent), "--period", "0.1"):
@@ -164,18 +163,17 @@ def test_battery_of_this_machine(onlooker: Onlooker, domain: int, tmp_path: Path
         assert "there is no battery" in onlooker.health("battery", level(DiagnosticStatus.ERROR)).message
 
 
-def test_battery_of_a_topic(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """Another node's battery, which tells its voltage alone, is judged by that."""
+def test_battery_of_a_topic(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
     states = onlooker.node.create_publisher(BatteryState, "/base/battery", 10)
     state = BatteryState(voltage=18.3, percentage=math.nan)
     with service(domain, tmp_path, "battery", "--topic", "/base/battery", "--volts", "18", "24"):
-        told = onlooker.health("battery", level(DiagnosticStatus.ERROR), lambda: states.publish(state))
-        assert told.message == "nearly empty: 5 %, charge it now"
-        assert {each.key: each.value for each in told.values}["volts"] == "18.30"
+        reported = onlooker.health("battery", level(DiagnosticStatus.ERROR), lambda: states.publish(state))
+        assert reported.message == "nearly empty: 5 %, charge it now"
+        assert {each.key: each.value for each in reported.values}["volts"] == "18.30"
 
 
-def test_gps_of_a_receiver(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """Positions come with their covariance, without a fix too, and what is broken is counted."""
+def test_gps_of_a_receiver(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
+    """With covariances; bad sentences are counted."""
     onlooker.watch("/fix", NavSatFix)
     here = sentence("GNGGA,120000,5005.400,N,01425.000,E,2,09,1.5,200.0,M,44.0,M,,") + b"\r\n"
     lost = sentence("GNGGA,120001,,,,,0,00,,,M,,M,,") + b"\r\n"
@@ -189,14 +187,14 @@ def test_gps_of_a_receiver(onlooker: Onlooker, domain: int, tmp_path: Path) -> N
             assert fix.altitude == pytest.approx(244.0)
             assert (fix.status.status, fix.position_covariance_type) == (1, 1)
             assert list(fix.position_covariance)[::4] == pytest.approx([2.25, 2.25, 9.0])
-            told = onlooker.health("gps", level(DiagnosticStatus.OK))
-            assert {each.key: each.value for each in told.values}["bad_sentences"] == "1"
+            reported = onlooker.health("gps", level(DiagnosticStatus.OK))
+            assert {each.key: each.value for each in reported.values}["bad_sentences"] == "1"
             receiver.sendall(lost)
             assert math.isnan(onlooker.newest("/fix", lambda each: each.status.status == -1).latitude)
 
 
-def test_markers_of_a_camera(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """A drawn marker has its number, and its place within two per cent; without a CameraInfo it says why not."""
+def test_markers_of_a_camera(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
+    """Within two per cent; without a CameraInfo the diagnostics give the reason."""
     onlooker.watch("/markers", MarkerArray)
     onlooker.watch("/markers/seen", String)
     images = onlooker.node.create_publisher(Image, "/camera/image_raw", qos_profile_sensor_data)
@@ -222,15 +220,15 @@ def test_markers_of_a_camera(onlooker: Onlooker, domain: int, tmp_path: Path) ->
         place = marker.pose.position
         assert (marker.id, marker.ns, marker.header.frame_id) == (7, "4X4_50", "camera_optical_frame")
         assert (place.x, place.y, place.z) == pytest.approx(at, rel=0.02)
-        told = orjson.loads(onlooker.newest("/markers/seen", meanwhile=publish).data)
-        (seen,) = told["markers"]
+        reported = orjson.loads(onlooker.newest("/markers/seen", meanwhile=publish).data)
+        (seen,) = reported["markers"]
         assert seen["id"] == 7
         assert seen["distance"] == pytest.approx(math.hypot(*at), rel=0.02)
         assert seen["bearing"] == pytest.approx(math.atan2(0.3, 1.2), abs=0.01)
 
 
-def test_markers_of_compressed_pictures(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """A JPEG of a camera whose view is given; a broken one is told and passed over."""
+def test_markers_of_compressed_images(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
+    """A broken image is reported."""
     onlooker.watch("/markers/seen", String)
     topic = "/camera/image_raw/compressed"
     images = onlooker.node.create_publisher(CompressedImage, topic, qos_profile_sensor_data)
@@ -243,13 +241,14 @@ def test_markers_of_compressed_pictures(onlooker: Onlooker, domain: int, tmp_pat
             lambda: any("JPEG" in each.status[0].message for each in onlooker.heard["/diagnostics"]),
             lambda: images.publish(broken),
         )
-        told = orjson.loads(onlooker.newest("/markers/seen", meanwhile=lambda: images.publish(whole)).data)
-        (seen,) = told["markers"]
+        reported = orjson.loads(
+            onlooker.newest("/markers/seen", meanwhile=lambda: images.publish(whole)).data
+        )
+        (seen,) = reported["markers"]
         assert (seen["id"], seen["distance"]) == (3, pytest.approx(0.9, rel=0.02))
 
 
-def test_faces_of_a_camera(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """Who is in the folder has her name, and is where she is; an empty picture has no face."""
+def test_faces_of_a_camera(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
     onlooker.watch("/faces", MarkerArray)
     onlooker.watch("/faces/seen", String)
     images = onlooker.node.create_publisher(Image, "/camera/image_raw", qos_profile_sensor_data)
@@ -260,9 +259,9 @@ def test_faces_of_a_camera(onlooker: Onlooker, domain: int, tmp_path: Path) -> N
         publish = repeated(lambda: images.publish(message), 0.05)
         (marker,) = onlooker.newest("/faces", lambda each: each.markers, meanwhile=publish).markers
         assert (marker.text, marker.header.frame_id) == ("eileen", "camera_optical_frame")
-        told = orjson.loads(onlooker.newest("/faces/seen", meanwhile=publish).data)
-        (seen,) = told["faces"]
-        assert (told["frame"], seen["name"]) == ("camera_optical_frame", "eileen")
+        reported = orjson.loads(onlooker.newest("/faces/seen", meanwhile=publish).data)
+        (seen,) = reported["faces"]
+        assert (reported["frame"], seen["name"]) == ("camera_optical_frame", "eileen")
         place = marker.pose.position
         assert seen["distance"] == pytest.approx(math.hypot(place.x, place.y, place.z), abs=0.01)
         assert "sees eileen" in onlooker.health("faces", level(DiagnosticStatus.OK), publish).message
@@ -270,39 +269,39 @@ def test_faces_of_a_camera(onlooker: Onlooker, domain: int, tmp_path: Path) -> N
         onlooker.newest("/faces/seen", lambda each: not orjson.loads(each.data)["faces"], meanwhile=publish)
 
 
-def test_speech_into_a_file(onlooker: Onlooker, domain: int, tmp_path: Path) -> None:
-    """Texts are said in order, told, and can be heard in the file; hushed there is nothing to say."""
+def test_speech_into_a_file(onlooker: TopicWatcher, domain: int, tmp_path: Path) -> None:
+    """Texts are spoken in order and reported; cancelled ones are not."""
     onlooker.watch("/said", String)
     onlooker.watch("/speaking", Bool, LATCHED)
     says = onlooker.node.create_publisher(String, "/say", 10)
-    hush = onlooker.node.create_client(Trigger, "/say/hush")
+    hush = onlooker.node.create_client(Trigger, "/say/cancel")
     texts = ["I am there.", "The battery is low, so I drive to the charger now."]
     with service(domain, tmp_path, "speech", "--out", str(tmp_path / "said.wav")):
-        # Until both ends have found each other what is said gets lost; not too often, or it would not take the rest.
+        # Messages before DDS has matched both are lost; a short pause leaves time for the rest.
         warm = repeated(lambda: says.publish(String(data="ready")), 1.0)
         onlooker.until("it is heard", lambda: onlooker.heard["/said"], warm)
         for text in texts:
             says.publish(String(data=text))
 
-        def told() -> list[str]:
+        def reported() -> list[str]:
             return [each.data for each in onlooker.heard["/said"] if each.data in texts]
 
-        onlooker.until("both are said", lambda: told() == texts)
+        onlooker.until("both are said", lambda: reported() == texts)
         onlooker.until(
             "silence", lambda: onlooker.heard["/speaking"] and not onlooker.heard["/speaking"][-1].data
         )
         onlooker.until("the service", hush.service_is_ready)
         asked = hush.call_async(Trigger.Request())
         onlooker.until("its answer", asked.done)
-        assert (asked.result().success, asked.result().message) == (True, "nothing was to be said")
+        assert (asked.result().success, asked.result().message) == (True, "no text was waiting")
     with wave.open(str(tmp_path / "said.wav")) as file:
         sound = np.frombuffer(file.readframes(file.getnframes()), np.int16).astype(float)
         assert 2 < len(sound) / file.getframerate() < 15
     assert np.abs(sound).max() > 3000
 
 
-def test_a_service_ends_cleanly_when_it_is_interrupted(domain: int, tmp_path: Path) -> None:
-    """Exit code 0 and not a word on stderr, as by SIGTERM."""
+def test_service_ends_cleanly_by_sigint(domain: int, tmp_path: Path) -> None:
+    """Exit code 0, and an empty stderr."""
     folder = supply(tmp_path / "BAT0", **LAPTOP)
     with service(domain, tmp_path, "battery", "--folder", str(folder)) as process:
         process.signal(signal.SIGINT)
@@ -311,17 +310,14 @@ def test_a_service_ends_cleanly_when_it_is_interrupted(domain: int, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "told"),
+    ("words", "code", "reported"),
     [
         (["battery", "--folder", "/nowhere"], 1, "No such file"),
-        (["battery", "--namespace", "a b"], 2, "'a b' is no ROS namespace"),
+        (["battery", "--namespace", "a b"], 2, "'a b' is not a ROS namespace"),
     ],
 )
-def test_what_makes_no_sense_is_told_in_a_sentence(
-    domain: int, words: list[str], code: int, told: str
-) -> None:
-    """On stderr, without a traceback."""
+def test_errors_are_sentences_on_stderr(domain: int, words: list[str], code: int, reported: str) -> None:
     environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     done = run_command([COMMAND, *words], env=environment)
     assert done.returncode == code
-    assert told in done.stderr and "Traceback" not in done.stderr
+    assert reported in done.stderr and "Traceback" not in done.stderr

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_client.sim.battery import (
+from robot_client.sim.robot import (
     CAPACITY_AH,
     CHARGER_AMPERES,
     EMPTY_VOLTS,
@@ -14,16 +14,14 @@ from robot_client.sim.battery import (
 )
 
 
-def test_standing_drains_the_idle_current() -> None:
-    """An hour at 1.2 A takes 1.2 Ah."""
+def test_idle_current_drains_the_battery() -> None:
     battery = SimBattery()
     battery.step(3600, 0.0, 0.0)
     assert battery.charge == pytest.approx(1 - IDLE_AMPERES / CAPACITY_AH)
 
 
 @given(speed=st.floats(0.01, 2), turn=st.floats(0.01, 3))
-def test_motion_costs_whichever_way(speed: float, turn: float) -> None:
-    """Driving and turning draw more than standing, backwards as much as forwards."""
+def test_motion_drains_more_in_any_direction(speed: float, turn: float) -> None:
     idle, ahead, back = SimBattery(), SimBattery(), SimBattery()
     idle.step(60, 0.0, 0.0)
     ahead.step(60, speed, turn)
@@ -34,7 +32,6 @@ def test_motion_costs_whichever_way(speed: float, turn: float) -> None:
 
 @given(st.lists(st.tuples(st.floats(0, 1e5), st.floats(-2, 2), st.floats(-3, 3)), max_size=20))
 def test_charge_only_falls_and_stays_within_bounds(steps: list[tuple[float, float, float]]) -> None:
-    """No step brings charge back, none goes below empty, and the voltage stays that of a pack."""
     battery = SimBattery()
     for seconds, speed, turn in steps:
         before = battery.charge
@@ -43,8 +40,8 @@ def test_charge_only_falls_and_stays_within_bounds(steps: list[tuple[float, floa
         assert EMPTY_VOLTS - 1 < battery.voltage <= FULL_VOLTS
 
 
-def test_a_charger_fills_it_and_then_feeds_the_robot() -> None:
-    """A tenth comes back in minutes; a full one draws nothing, gives nothing, and drains again without."""
+def test_charger_fills_the_battery() -> None:
+    """A full one draws nothing."""
     battery = SimBattery(0.1)
     battery.step(300, 0.0, 0.0, charging=True)
     assert battery.charging and battery.current == pytest.approx(IDLE_AMPERES - CHARGER_AMPERES)

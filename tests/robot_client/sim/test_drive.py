@@ -1,4 +1,4 @@
-"""The body's physics: limits, exact arcs, quick stops, and walls that hold."""
+"""The body's physics: limits, exact arcs, braking and walls."""
 
 import math
 from collections.abc import Iterator
@@ -8,9 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from robot_client.sim.drive import HIGHEST_SPEED, RADIUS, STANDING, MotorLimits, SimBody, Twist, along_arc
-from robot_client.sim.world import Circle, Colour, Pose, Segment, Texture, WallTexture, World, box
-from robot_client.sim.worlds import WORLDS
+from robot_client.sim.drive import HIGHEST_SPEED, RADIUS, ZERO_TWIST, MotorLimits, SimBody, Twist, along_arc
+from robot_client.sim.world import WORLDS, Circle, Colour, Pose, Segment, Texture, WallTexture, World, box
 
 STEP = 0.02
 GREY = WallTexture(Colour(128, 128, 128), Texture.BRICK)
@@ -36,7 +35,7 @@ def drive(each: SimBody, speed: float, turn: float, steps: int) -> None:
 
 
 class Step(NamedTuple):
-    """What was asked, and how the body was just before."""
+    """The commanded velocity, and the body before the step."""
 
     asked: Twist
     velocity: Twist
@@ -56,8 +55,7 @@ def steps(robot: SimBody, commands: list[tuple[float, float, int]]) -> Iterator[
 @given(COMMANDS)
 @example([(HIGHEST_SPEED, 0.0, 400)])
 @example([(-HIGHEST_SPEED, 0.0, 400), (HIGHEST_SPEED, 3.0, 400)])
-def test_never_inside_a_wall(commands: list[tuple[float, float, int]]) -> None:
-    """Whatever is asked at the highest speed, the hull overlaps no obstacle and stays in the hall."""
+def test_body_never_overlaps_a_wall(commands: list[tuple[float, float, int]]) -> None:
     robot = body(HALL, HALL.start, HIGHEST_SPEED)
     for _ in steps(robot, commands):
         assert HALL.nearest(robot.pose.x, robot.pose.y).distance >= RADIUS
@@ -66,8 +64,7 @@ def test_never_inside_a_wall(commands: list[tuple[float, float, int]]) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(COMMANDS)
-def test_no_energy_from_nowhere(commands: list[tuple[float, float, int]]) -> None:
-    """Speed never exceeds what was asked or what was there, and never grows faster than the motors can."""
+def test_speed_never_exceeds_command_and_limits(commands: list[tuple[float, float, int]]) -> None:
     robot = body(HALL, HALL.start, HIGHEST_SPEED)
     for asked, before, _ in steps(robot, commands):
         now = robot.velocity
@@ -78,8 +75,7 @@ def test_no_energy_from_nowhere(commands: list[tuple[float, float, int]]) -> Non
 
 @settings(max_examples=60, deadline=None)
 @given(COMMANDS)
-def test_says_it_stands_only_when_it_stands(commands: list[tuple[float, float, int]]) -> None:
-    """`moving` is the truth about the pose: no step changes it while the body claims to stand."""
+def test_moving_is_true_whenever_the_pose_changes(commands: list[tuple[float, float, int]]) -> None:
     robot = body(HALL, HALL.start, HIGHEST_SPEED)
     for _, _, before in steps(robot, commands):
         if not robot.moving:
@@ -88,7 +84,6 @@ def test_says_it_stands_only_when_it_stands(commands: list[tuple[float, float, i
 
 @given(speed=st.floats(-0.5, 0.5), turn=st.floats(-2, 2), heading=st.floats(-3, 3), cuts=st.integers(2, 20))
 def test_arcs_are_exact(speed: float, turn: float, heading: float, cuts: int) -> None:
-    """One arc of a second ends where many small ones do: no error of integration."""
     begin = Pose(1.0, 2.0, heading)
     pose = begin
     for _ in range(cuts):
@@ -98,8 +93,7 @@ def test_arcs_are_exact(speed: float, turn: float, heading: float, cuts: int) ->
     assert math.remainder(pose.heading - whole.heading, math.tau) == pytest.approx(0, abs=1e-9)
 
 
-def test_full_circle_comes_home() -> None:
-    """v/w is the radius: after 2π/w seconds the body is where it began."""
+def test_full_circle_ends_at_its_start() -> None:
     pose = Pose(0.5, -0.5, 0.7)
     for _ in range(100):
         pose = along_arc(pose, Twist(0.4, math.tau / 2.0), 0.02)
@@ -107,17 +101,15 @@ def test_full_circle_comes_home() -> None:
 
 
 def test_stops_within_two_steps_from_the_default_speed() -> None:
-    """0.5 m/s and 2 rad/s are gone 40 ms after the first step that knows of the zero."""
     robot = body()
     drive(robot, 0.5, 2.0, 100)
     assert robot.velocity == (0.5, 2.0)
     drive(robot, 0.0, 0.0, 2)
-    assert robot.velocity == STANDING
+    assert robot.velocity == ZERO_TWIST
     assert not robot.moving
 
 
-def test_braking_way_is_centimetres() -> None:
-    """From 0.5 m/s the robot rolls less than a centimetre."""
+def test_braking_distance_is_below_a_centimetre() -> None:
     robot = body()
     drive(robot, 0.5, 0.0, 100)
     before = robot.pose.x
@@ -125,15 +117,13 @@ def test_braking_way_is_centimetres() -> None:
     assert 0 < robot.pose.x - before < 0.01
 
 
-def test_starts_at_the_motors_pace() -> None:
-    """After a tenth of a second at 1.5 m/s² the speed is 0.15 m/s."""
+def test_acceleration_is_that_of_the_motors() -> None:
     robot = body()
     drive(robot, 0.5, 0.0, 5)
     assert robot.velocity.speed == pytest.approx(0.15)
 
 
 def test_lower_limit_takes_effect_while_driving() -> None:
-    """A speed over a new limit is braked to it."""
     robot = body()
     drive(robot, 0.5, 0.0, 100)
     robot.limits = robot.limits._replace(speed=0.2)
@@ -142,7 +132,6 @@ def test_lower_limit_takes_effect_while_driving() -> None:
 
 
 def test_reversing_passes_through_zero() -> None:
-    """Braking ends at zero before the other way begins, so the start is never as hard as a stop."""
     robot = body()
     drive(robot, 0.5, 0.0, 100)
     drive(robot, -0.5, 0.0, 2)
@@ -151,21 +140,20 @@ def test_reversing_passes_through_zero() -> None:
     assert robot.velocity.speed == pytest.approx(-0.03)
 
 
-def test_stands_stalled_at_a_wall_head_on() -> None:
-    """Against a wall the body comes to rest at its hull's radius, blocked, and reverses freely."""
+def test_body_is_blocked_at_a_wall_head_on() -> None:
+    """It can reverse."""
     world = World([Segment(1, -5, 1, 5, GREY)], [], Pose(0, 0, 0))
     robot = body(world)
     drive(robot, 0.5, 0.0, 400)
     assert robot.pose.x == pytest.approx(1 - RADIUS, abs=1e-4)
-    assert robot.velocity == STANDING
+    assert robot.velocity == ZERO_TWIST
     assert robot.blocked and not robot.moving
     drive(robot, -0.5, 0.0, 50)
     assert robot.pose.x < 0.7
     assert not robot.blocked
 
 
-def test_slides_along_a_wall_met_at_a_flat_angle() -> None:
-    """A slanting approach keeps the part of the speed that runs along the wall."""
+def test_body_slides_along_a_wall() -> None:
     world = World([Segment(-50, 1, 50, 1, GREY)], [], Pose(0, 0, 0))
     robot = body(world, Pose(0, 0.5, math.radians(20)))
     drive(robot, 0.5, 0.0, 400)
@@ -174,8 +162,7 @@ def test_slides_along_a_wall_met_at_a_flat_angle() -> None:
     assert robot.moving and not robot.blocked
 
 
-def test_turns_on_the_spot_at_a_wall() -> None:
-    """A round hull can always turn, even when it touches."""
+def test_body_can_turn_at_a_wall() -> None:
     world = World([Segment(1, -5, 1, 5, GREY)], [], Pose(0, 0, 0))
     robot = body(world)
     drive(robot, 0.5, 0.0, 300)
@@ -183,8 +170,7 @@ def test_turns_on_the_spot_at_a_wall() -> None:
     assert robot.pose.heading > 1.0
 
 
-def test_a_wedge_narrower_than_the_hull_holds_it() -> None:
-    """Between two pillars closer than its width the body stays out."""
+def test_body_stays_out_of_a_narrow_gap() -> None:
     pillars = [Circle(1, 0.3, 0.2, GREY), Circle(1, -0.3, 0.2, GREY)]
     world = World([], pillars, Pose(0, 0, 0))
     robot = body(world, speed=HIGHEST_SPEED)
@@ -193,8 +179,7 @@ def test_a_wedge_narrower_than_the_hull_holds_it() -> None:
     assert robot.blocked
 
 
-def test_a_long_time_is_cut_into_steps() -> None:
-    """A second at once does what fifty steps do: no wall is jumped over."""
+def test_long_times_are_cut_into_steps() -> None:
     world = World([Segment(1, -5, 1, 5, GREY)], [], Pose(0, 0, 0))
     robot = body(world, speed=HIGHEST_SPEED)
     robot.target = Twist(HIGHEST_SPEED, 0.0)
@@ -202,10 +187,30 @@ def test_a_long_time_is_cut_into_steps() -> None:
     assert robot.pose.x < 1.0
 
 
-def test_reset_stands_still() -> None:
-    """After a reset nothing of the drive is left."""
+def test_reset_ends_all_motion() -> None:
     robot = body()
     drive(robot, 0.5, 1.0, 100)
     robot.reset(Pose(3, 4, 1))
     robot.step(STEP)
-    assert (robot.pose, robot.velocity, robot.travelled, robot.moving) == ((3, 4, 1), STANDING, 0.0, False)
+    assert (robot.pose, robot.velocity, robot.travelled, robot.moving) == ((3, 4, 1), ZERO_TWIST, 0.0, False)
+
+
+@settings(max_examples=60, deadline=None)
+@given(COMMANDS)
+def test_a_body_that_has_stood_drives_as_any_other(commands: list[tuple[float, float, int]]) -> None:
+    """Steps in which nothing changes are skipped."""
+    fresh, stood = (body(HALL, HALL.start, HIGHEST_SPEED) for _ in range(2))
+    drive(stood, 0.0, 0.0, 5)
+    assert stood.pose == HALL.start
+    for speed, turn, count in commands:
+        drive(fresh, speed, turn, count)
+        drive(stood, speed, turn, count)
+        assert (stood.pose, stood.velocity, stood.moving) == (fresh.pose, fresh.velocity, fresh.moving)
+
+
+def test_a_body_that_is_put_into_a_wall_after_it_has_stood_is_pushed_out() -> None:
+    robot = body()
+    drive(robot, 0.0, 0.0, 5)
+    robot.pose = Pose(19.9, 0.0, 0.0)
+    drive(robot, 0.0, 0.0, 5)
+    assert robot.pose.x <= 20 - RADIUS

@@ -1,4 +1,4 @@
-"""What the robot says of itself fits its state."""
+"""Diagnostics of the simulated robot."""
 
 import pytest
 
@@ -17,12 +17,10 @@ from robot_client.sim.health import Severity
     ],
 )
 def test_battery_warns_before_it_is_empty(charge: float, severity: Severity) -> None:
-    """Below a fifth it warns, below a twentieth it is an error."""
     assert health.battery(charge, 22.0, 1.0).severity is severity
 
 
 def test_blocked_motors_warn() -> None:
-    """A robot held by an obstacle says so in words."""
     finding = health.motors(0.0, 0.0, blocked=True, travelled=1.0)
     assert finding.severity is Severity.WARN
     assert "obstacle" in finding.message
@@ -31,8 +29,7 @@ def test_blocked_motors_warn() -> None:
 @pytest.mark.parametrize(
     ("speed", "turn", "message"), [(0.1, 0, "driving"), (0, 0.1, "driving"), (0, 0, "standing")]
 )
-def test_free_motors_are_well(speed: float, turn: float, message: str) -> None:
-    """Driving and standing are both fine."""
+def test_free_motors_are_ok(speed: float, turn: float, message: str) -> None:
     finding = health.motors(speed, turn, blocked=False, travelled=1.0)
     assert (finding.severity, finding.message) == (Severity.OK, message)
 
@@ -45,15 +42,11 @@ def test_free_motors_are_well(speed: float, turn: float, message: str) -> None:
         (False, 0, Severity.STALE, "switched off"),
     ],
 )
-def test_camera_tells_whether_it_streams(
-    enabled: bool, viewers: int, severity: Severity, message: str
-) -> None:
-    """Off is stale, not broken; on without viewers is fine."""
+def test_states_of_the_camera(enabled: bool, viewers: int, severity: Severity, message: str) -> None:
     finding = health.camera(enabled, viewers, 10, 3.0)
     assert (finding.severity, finding.message) == (severity, message)
 
 
-def test_a_battery_that_charges_is_never_low() -> None:
-    """However little is in it."""
+def test_charging_battery_is_never_low() -> None:
     assert health.battery(0.01, 19.9, -8.8, charging=True)[1:3] == (Severity.OK, "charging")
     assert health.battery(1.0, 25.2, 0.0, charging=True)[1:3] == (Severity.OK, "full")

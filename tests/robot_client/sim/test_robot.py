@@ -1,4 +1,4 @@
-"""The robot without ROS: commands, time-out, reset, scan, and a record that is the truth."""
+"""The simulated robot without ROS: commands, timeout, reset, scan and record."""
 
 import io
 import json
@@ -7,10 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from robot_client.sim.recorder import MotionRecorder
-from robot_client.sim.robot import SCAN_FARTHEST, SCAN_RAYS, SimRobot
-from robot_client.sim.world import Pose
-from robot_client.sim.worlds import WORLDS
+from robot_client.sim.robot import SCAN_FARTHEST, SCAN_RAYS, MotionRecorder, SimRobot
+from robot_client.sim.world import WORLDS, Pose
 
 STEP = 0.02
 
@@ -34,8 +32,7 @@ class Bench:
         return [json.loads(line) for line in self.stream.getvalue().splitlines()]
 
 
-def test_record_tells_commands_motion_and_rest_with_times() -> None:
-    """Command, moving with the next step, zero, standstill within 60 ms."""
+def test_record_has_commands_motion_and_standstill() -> None:
     bench = Bench()
     bench.robot.command(0.5, 0.0)
     bench.run(1.0)
@@ -50,7 +47,6 @@ def test_record_tells_commands_motion_and_rest_with_times() -> None:
 
 
 def test_without_timeout_the_last_command_holds() -> None:
-    """Like many bases, it drives on: what is above it has to stop it."""
     bench = Bench()
     bench.robot.command(0.3, 0.0)
     bench.run(10.0)
@@ -58,7 +54,6 @@ def test_without_timeout_the_last_command_holds() -> None:
 
 
 def test_timeout_stops_the_robot() -> None:
-    """With the parameter set it stops by itself and says when."""
     bench = Bench()
     bench.robot.command_timeout = 0.5
     bench.robot.command(0.3, 0.0)
@@ -68,8 +63,7 @@ def test_timeout_stops_the_robot() -> None:
 
 
 @pytest.mark.parametrize(("speed", "turn"), [(math.nan, 0.0), (0.2, math.inf)])
-def test_what_is_no_number_stops(speed: float, turn: float) -> None:
-    """NaN and infinity are a stop, and null in the record."""
+def test_values_that_are_not_finite_stop_the_robot(speed: float, turn: float) -> None:
     bench = Bench()
     bench.robot.command(0.3, 0.0)
     bench.run(0.5)
@@ -79,8 +73,7 @@ def test_what_is_no_number_stops(speed: float, turn: float) -> None:
     assert None in (bench.record[2]["v"], bench.record[2]["w"])
 
 
-def test_reset_brings_everything_back() -> None:
-    """Place and charge are those of the beginning; the record tells reset, then standstill."""
+def test_reset_restores_pose_and_charge() -> None:
     bench = Bench()
     bench.robot.command(0.5, 0.5)
     bench.run(3.0)
@@ -90,8 +83,7 @@ def test_reset_brings_everything_back() -> None:
     assert [event["event"] for event in bench.record[-2:]] == ["reset", "standstill"]
 
 
-def test_scan_is_true_up_to_its_noise() -> None:
-    """The ray straight ahead and the one to the left are at their indices."""
+def test_scan_is_exact_up_to_its_noise() -> None:
     bench = Bench("default")
     scan = bench.robot.scan()
     start = bench.robot.world.start
@@ -102,20 +94,17 @@ def test_scan_is_true_up_to_its_noise() -> None:
 
 
 def test_scan_of_the_open_field_is_infinite() -> None:
-    """Beyond the scanner's reach there is nothing, not a distance."""
     assert np.isinf(Bench("open").robot.scan()).all()
 
 
-def test_noise_repeats_with_its_seed_only() -> None:
-    """Same seed, same scan; another seed, another scan; never beyond the range."""
+def test_noise_depends_on_its_seed() -> None:
     one, same, other = (Bench("default", seed).robot.scan() for seed in (5, 5, 6))
     assert np.array_equal(one, same)
     assert not np.array_equal(one, other)
     assert one[np.isfinite(one)].max() <= SCAN_FARTHEST
 
 
-def test_it_is_charged_while_it_stands_at_the_charger() -> None:
-    """Not while it drives there, nor where none is; a reset gives back the charge of the beginning."""
+def test_battery_is_charged_at_the_charger_at_rest() -> None:
     place = Pose(-2.7, -4.0, -math.pi / 2)
     robot = SimRobot(WORLDS["default"](), MotionRecorder(None), 1, clock=lambda: 0.0, charge=0.15)
     robot.step(STEP)

@@ -27,8 +27,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
 from std_srvs.srv import Trigger
-from switchboard_domains import free_domain
-from switchboard_processes import mortal
+
+from tests.worlds.processes import mortal
+from tests.worlds.ros_domains import free_domain
 
 PATIENCE = 60.0
 """Seconds; only a failure takes that long."""
@@ -38,7 +39,7 @@ SETTINGS = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCA
 
 @contextlib.contextmanager
 def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
-    """A running simulator that has said READY; ended and reaped afterwards."""
+    """A running simulator that has printed READY."""
     process = subprocess.Popen(
         mortal([sys.executable, "-m", "robot_client.sim.main", *options]),
         env={**os.environ, **SETTINGS},
@@ -62,7 +63,7 @@ def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
 
 
 class Graph:
-    """A node of the test in the simulator's graph, keeping the newest message of each topic."""
+    """A node of the test, with the newest message of each topic."""
 
     def __init__(self) -> None:
         self._context = rclpy.Context()
@@ -78,7 +79,7 @@ class Graph:
         rclpy.shutdown(context=self._context)
 
     def wait_for(self, fact: Callable[[], Any], meanwhile: Callable[[], None] | None = None) -> Any:
-        """Spin until a fact holds and return it; in between do something again and again."""
+        """Spin until a condition holds, and return its value; in between repeat an action."""
         deadline = time.monotonic() + PATIENCE
         while not (value := fact()):
             assert time.monotonic() < deadline, "it didn't come about in time"
@@ -88,7 +89,7 @@ class Graph:
         return value
 
     def watch(self, topic: str, kind: type, qos: Any = 10) -> Callable[[], Any]:
-        """Subscribe; returns what gives a message that came after its call."""
+        """Subscribe; return a function that gives a message that arrived after its call."""
         self.node.create_subscription(kind, topic, lambda m: self.newest.__setitem__(topic, m), qos)
 
         def fresh() -> Any:
@@ -98,7 +99,7 @@ class Graph:
         return fresh
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
-        """Ask a service that may be asked twice: an answer can be lost while the two still find each other."""
+        """Call a service until it responds: a response can be lost during discovery."""
         client = self.node.create_client(kind, name)
         self.wait_for(client.service_is_ready)
         asked: list[Any] = []
@@ -113,10 +114,7 @@ class Graph:
         return answered.result()
 
     def driver(self, topic: str) -> Callable[[float, float, Callable[[], Any]], Any]:
-        """What publishes a velocity until a fact holds, and returns the fact.
-
-        Once isn't enough: the robot may not have found the publisher yet when the publisher has found the robot.
-        """
+        """Publish a velocity until a condition holds; once is not enough during discovery."""
         publisher = self.node.create_publisher(Twist, topic, 10)
 
         def drive(speed: float, turn: float, until: Callable[[], Any]) -> Any:
@@ -148,8 +146,7 @@ def set_speed(graph: Graph, value: float) -> Any:
     return graph.call(SetParameters, "/switchboard_sim/set_parameters", request).results[0]
 
 
-def test_drives_when_told_and_resets(robot: subprocess.Popen[str], graph: Graph) -> None:
-    """/cmd_vel moves /odom; a zero stops it; /reset puts it back to its start."""
+def test_robot_drives_stops_and_resets(robot: subprocess.Popen[str], graph: Graph) -> None:
     odom = graph.watch("/odom", Odometry)
     drive = graph.driver("/cmd_vel")
     begin = odom()
@@ -165,7 +162,6 @@ def test_drives_when_told_and_resets(robot: subprocess.Popen[str], graph: Graph)
 
 
 def test_max_speed_takes_effect_at_once_and_is_bounded(robot: subprocess.Popen[str], graph: Graph) -> None:
-    """Setting the parameter slows a driving robot; a value out of range is refused and changes nothing."""
     odom = graph.watch("/odom", Odometry)
     drive = graph.driver("/cmd_vel")
     assert set_speed(graph, 0.1).successful
@@ -180,7 +176,6 @@ def test_max_speed_takes_effect_at_once_and_is_bounded(robot: subprocess.Popen[s
 
 
 def test_scan_has_a_ray_for_every_degree(robot: subprocess.Popen[str], graph: Graph) -> None:
-    """360 rays once around, all within the limits the message states."""
     scan = graph.watch("/scan", LaserScan, qos_profile_sensor_data)()
     ranges = np.array(scan.ranges)
     assert len(ranges) == 360
@@ -192,8 +187,7 @@ def test_scan_has_a_ray_for_every_degree(robot: subprocess.Popen[str], graph: Gr
     assert scan.header.frame_id == "laser"
 
 
-def test_pictures_raw_and_compressed(robot: subprocess.Popen[str], graph: Graph) -> None:
-    """The JPEG decodes, the raw picture is rgb8, and both show the same scene."""
+def test_images_raw_and_compressed(robot: subprocess.Popen[str], graph: Graph) -> None:
     jpeg = graph.watch("/camera/image_raw/compressed", CompressedImage, qos_profile_sensor_data)()
     decoded = cv2.imdecode(np.frombuffer(jpeg.data, np.uint8), cv2.IMREAD_COLOR)
     assert decoded.shape == (480, 640, 3)
@@ -205,8 +199,7 @@ def test_pictures_raw_and_compressed(robot: subprocess.Popen[str], graph: Graph)
     assert np.abs(difference).mean() < 6
 
 
-def test_the_camera_has_the_size_and_rate_it_is_told(graph: Graph) -> None:
-    """Both topics carry it, and no more than two pictures come in a second."""
+def test_camera_has_the_configured_size_and_rate(graph: Graph) -> None:
     with simulator("--namespace", "large", "--camera-size", "1280x720", "--camera-fps", "2"):
         raw = graph.watch("/large/camera/image_raw", Image, qos_profile_sensor_data)()
         assert (raw.width, raw.height, raw.step, len(raw.data)) == (1280, 720, 3840, 3840 * 720)
@@ -218,7 +211,6 @@ def test_the_camera_has_the_size_and_rate_it_is_told(graph: Graph) -> None:
 
 
 def test_transforms_agree_with_odometry(robot: subprocess.Popen[str], graph: Graph) -> None:
-    """/tf tells where the body stands, /tf_static (latched) where the sensors sit."""
     graph.watch("/odom", Odometry)()
     topics = dict(graph.node.get_topic_names_and_types())
     if importlib.util.find_spec("tf2_msgs") is None:
@@ -229,7 +221,9 @@ def test_transforms_agree_with_odometry(robot: subprocess.Popen[str], graph: Gra
     graph.call(Trigger, "/reset", Trigger.Request())
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     fixed = graph.watch("/tf_static", TFMessage, latched)().transforms
-    assert {each.child_frame_id for each in fixed} == {"laser", "camera"}
+    sensors = {"laser", "camera", "camera_depth_optical_frame"}
+    assert {each.child_frame_id for each in fixed} == {*sensors, "odom"}
+    assert {each.header.frame_id for each in fixed if each.child_frame_id == "odom"} == {"map"}
     (moving,) = graph.watch("/tf", TFMessage)().transforms
     assert (moving.header.frame_id, moving.child_frame_id) == ("odom", "base_link")
     stands_at = graph.watch("/odom", Odometry)().pose.pose.position
@@ -237,15 +231,13 @@ def test_transforms_agree_with_odometry(robot: subprocess.Popen[str], graph: Gra
 
 
 def test_battery_drains(robot: subprocess.Popen[str], graph: Graph) -> None:
-    """Charge is a share and falls from one message to the next."""
     battery = graph.watch("/battery_state", BatteryState)
     first, second = battery(), battery()
     assert 0 < second.percentage < first.percentage <= 1
     assert second.voltage > 18 and second.current < 0
 
 
-def test_diagnostics_tell_a_stall(robot: subprocess.Popen[str], graph: Graph) -> None:
-    """Three parts report; driven against a wall the motors warn, after a reset they don't."""
+def test_diagnostics_report_a_stall(robot: subprocess.Popen[str], graph: Graph) -> None:
     diagnostics = graph.watch("/diagnostics", DiagnosticArray)
 
     def motors() -> DiagnosticStatus:
@@ -265,7 +257,6 @@ def test_diagnostics_tell_a_stall(robot: subprocess.Popen[str], graph: Graph) ->
 
 
 def test_two_namespaces_are_two_robots(graph: Graph) -> None:
-    """Each hears its own /cmd_vel only, and their frames differ."""
     with simulator("--namespace", "one", "--no-camera"), simulator("--namespace", "/two", "--no-camera"):
         one, two = (graph.watch(f"/{name}/odom", Odometry) for name in ("one", "two"))
         still = two().pose.pose.position
@@ -276,7 +267,7 @@ def test_two_namespaces_are_two_robots(graph: Graph) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_ends_cleanly_by_signal(number: signal.Signals) -> None:
-    """Exit code 0 and not a word on stderr."""
+    """Exit code 0, and an empty stderr."""
     with simulator("--no-camera") as process:
         process.send_signal(number)
         _, errors = process.communicate(timeout=PATIENCE)
@@ -284,7 +275,6 @@ def test_ends_cleanly_by_signal(number: signal.Signals) -> None:
 
 
 def test_record_is_written_at_once(graph: Graph, tmp_path: Path) -> None:
-    """While the robot runs, its record already tells command, motion and standstill, in this order."""
     file = tmp_path / "record.jsonl"
 
     def events() -> list[dict[str, Any]]:
@@ -310,14 +300,13 @@ def test_record_is_written_at_once(graph: Graph, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        ("--namespace", "a b", "'a b' is no ROS namespace"),
-        ("--camera-size", "1280", "'1280' is no size: write width and height in pixels, as 1280x720"),
+        ("--namespace", "a b", "'a b' is not a ROS namespace"),
+        ("--camera-size", "1280", "'1280' is not a size; write width and height in pixels, as 1280x720"),
         ("--camera-size", "1280x2000", "1280x2000 is out of range: 320x240 to 1920x1080"),
         ("--camera-fps", "61", "61 is not in the range"),
     ],
 )
-def test_what_makes_no_sense_is_told_in_a_sentence(option: str, value: str, words: str) -> None:
-    """It is refused before anything runs."""
+def test_invalid_options_are_reported(option: str, value: str, words: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "robot_client.sim.main", option, value],
         env={**os.environ, **SETTINGS},

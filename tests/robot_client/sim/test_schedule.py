@@ -10,8 +10,7 @@ class Clock:
         return self.now
 
 
-def test_each_task_runs_at_its_own_rate() -> None:
-    """In a second of small steps a 50 Hz task runs 50 times and a 15 Hz task 15 times."""
+def test_tasks_run_at_their_own_rates() -> None:
     clock, done = Clock(), {"fast": 0, "slow": 0}
     schedule = Schedule(clock)
     for name, rate in (("fast", 50), ("slow", 15)):
@@ -22,8 +21,7 @@ def test_each_task_runs_at_its_own_rate() -> None:
     assert done == {"fast": 50, "slow": 15}
 
 
-def test_tells_how_long_nothing_is_due() -> None:
-    """The pause ends with the earliest task."""
+def test_run_due_returns_the_time_until_the_next_task() -> None:
     clock = Clock()
     schedule = Schedule(clock)
     schedule.every(0.5, lambda: None)
@@ -31,8 +29,7 @@ def test_tells_how_long_nothing_is_due() -> None:
     assert schedule.run_due() == 0.2
 
 
-def test_a_hold_up_is_made_good_within_bounds() -> None:
-    """Three steps late are three steps; ten seconds late are no five hundred."""
+def test_missed_runs_are_made_up_within_bounds() -> None:
     clock, done = Clock(), []
     schedule = Schedule(clock)
     schedule.every(0.02, lambda: done.append(clock.now), catch_up=5)

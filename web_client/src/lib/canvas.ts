@@ -14,7 +14,7 @@ export function fitted(canvas: HTMLCanvasElement, draw: () => void): () => void 
   return () => observer.disconnect()
 }
 
-/** A cleared surface to draw on, measured in CSS pixels; null while the canvas has no size. */
+/** The cleared context of the canvas, in CSS pixels; null while the canvas has no size. */
 export function surface(canvas: HTMLCanvasElement): Surface | null {
   const width = canvas.clientWidth
   const height = canvas.clientHeight
@@ -35,10 +35,20 @@ export const INK = {
   accent: '#58c4d6',
   robot: '#e3e9ee',
   stale: '#5b6874',
+  ground: '#10161c',
+  goal: '#55c08a',
+  path: '#e3b052',
 }
 
 /** The robot as an arrowhead, pointing along an angle (0 is right, counter-clockwise, radians). */
-export function arrow(context: CanvasRenderingContext2D, x: number, y: number, angle: number, size: number): void {
+export function arrow(
+  context: CanvasRenderingContext2D,
+  x: number,
+  y: number,
+  angle: number,
+  size: number,
+  fill = INK.robot,
+): void {
   context.save()
   context.translate(x, y)
   context.rotate(-angle)
@@ -48,7 +58,7 @@ export function arrow(context: CanvasRenderingContext2D, x: number, y: number, a
   context.lineTo(-size * 0.35, 0)
   context.lineTo(-size * 0.7, -size * 0.65)
   context.closePath()
-  context.fillStyle = INK.robot
+  context.fillStyle = fill
   context.fill()
   context.restore()
 }

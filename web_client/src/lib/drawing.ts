@@ -1,12 +1,12 @@
-/** The pictures of the cockpit: scan and trail. */
+/** Drawings of the cockpit: scan and trail. */
 import { arrow, INK, type Surface } from './canvas'
-import { view } from './odometry'
-import { rings } from './scan'
+import { view } from './ros/odometry'
+import { rings } from './ros/scan'
 
-/** Draws scan points with the robot in the middle, ahead is up.
+/** Draws scan points with the robot in the centre; forward is up.
  *
  * @param points pairs x, y in metres
- * @param radiusM distance from the middle to the nearer edge, metres
+ * @param radiusM distance from the centre to the nearest edge, metres
  */
 export function drawScan(surface: Surface, points: Float32Array, radiusM: number, stale: boolean): void {
   const { context: c, width, height } = surface
@@ -40,7 +40,7 @@ function cross({ context: c, width, height }: Surface, x: number, y: number): vo
   c.stroke()
 }
 
-/** Draws where the robot has been; x to the right, y up, as in the odometry frame. */
+/** Draws the path of the robot; x to the right, y up, as in the odometry frame. */
 export function drawTrail(surface: Surface, trail: [number, number][], heading: number, stale: boolean): void {
   const { context: c, width, height } = surface
   const { centreX, centreY, half } = view(trail)

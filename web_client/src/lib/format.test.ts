@@ -8,6 +8,7 @@ import {
   lasting,
   milliseconds,
   moment,
+  timeOfDay,
   number,
   people,
   percent,
@@ -99,6 +100,12 @@ it('writes sizes, spans and large numbers', () => {
   ])
   expect([0, 42.9, 725, 3723, 86_400].map(stopwatch)).toEqual(['0:00', '0:42', '12:05', '1:02:03', '24:00:00'])
   expect([7, 1234, 1_234_567].map(count)).toEqual(['7', '1\u202f234', '1\u202f234\u202f567'])
+})
+
+it('names the date of a time only where it is another day', () => {
+  const then = Date.UTC(2026, 5, 15, 12) / 1000
+  expect(timeOfDay(then, then + 60)).not.toMatch(/Jun|15/)
+  expect(timeOfDay(then, then + 3 * 86_400)).toMatch(/15/)
 })
 
 it('names the year only where it is another one', () => {

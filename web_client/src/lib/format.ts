@@ -28,7 +28,7 @@ export function bytesPerSecond(value: number): string {
   return `${(value / 1e6).toFixed(value < 1e7 ? 1 : 0)} MB/s`
 }
 
-/** A size in the units disks are sold in. */
+/** A size in decimal units. */
 export function fileSize(bytes: number): string {
   const units: [number, string][] = [
     [1e9, 'GB'],
@@ -36,13 +36,13 @@ export function fileSize(bytes: number): string {
     [1e3, 'kB'],
   ]
   for (const [unit, name] of units) {
-    // What would be rounded to 1000 is one of the next unit.
+    // A value that would be rounded to 1000 gets the next unit.
     if (bytes >= unit * 0.9995) return `${(bytes / unit).toFixed(bytes < unit * 99.95 ? 1 : 0).replace(/\.0$/, '')} ${name}`
   }
   return `${bytes} B`
 }
 
-/** A span of time as on a stopwatch: 0:42, 12:05, 1:02:03. */
+/** A duration as on a stopwatch: 0:42, 12:05, 1:02:03. */
 export function stopwatch(seconds: number): string {
   const whole = Math.max(0, Math.floor(seconds))
   const parts = [Math.floor(whole / 60) % 60, whole % 60]
@@ -51,19 +51,26 @@ export function stopwatch(seconds: number): string {
   return [first, ...rest.map((part) => String(part).padStart(2, '0'))].join(':')
 }
 
-/** A whole number with its thousands set apart. */
+/** A whole number with its thousands separated. */
 export function count(value: number): string {
   return String(value).replace(/\B(?=(\d{3})+$)/g, '\u202f')
 }
 
-/** A moment as the calendar says it, with the year where it is another one. Both in Unix seconds. */
+/** Date and time; with the year if it is not the present one. Both arguments in Unix seconds. */
 export function moment(then: number, now: number): string {
   const [at, today] = [new Date(then * 1000), new Date(now * 1000)]
   const year = at.getFullYear() === today.getFullYear() ? undefined : 'numeric'
   return at.toLocaleString(undefined, { year, month: 'short', day: 'numeric', hour: 'numeric', minute: '2-digit' })
 }
 
-/** How long ago a moment was, in words. Both in Unix seconds. */
+/** Time of the day; with its date unless it is the present one. Both arguments in Unix seconds. */
+export function timeOfDay(then: number, now: number): string {
+  const [at, today] = [new Date(then * 1000), new Date(now * 1000)]
+  if (at.toDateString() !== today.toDateString()) return moment(then, now)
+  return at.toLocaleTimeString(undefined, { hour: 'numeric', minute: '2-digit', second: '2-digit' })
+}
+
+/** Time since a moment, in words. Both arguments in Unix seconds. */
 export function ago(then: number | null, now: number): string {
   if (then === null) return 'never'
   const seconds = Math.max(0, Math.round(now - then))
@@ -75,7 +82,7 @@ export function ago(then: number | null, now: number): string {
   return days === 1 ? 'a day ago' : `${days} days ago`
 }
 
-/** For how long something has lasted, in words. Both in Unix seconds. */
+/** Duration since a moment, in words. Both arguments in Unix seconds. */
 export function lasting(since: number, now: number): string {
   const words = ago(since, now)
   return words === 'just now' ? 'a moment' : words.replace(/ ago$/, '')
@@ -89,7 +96,7 @@ export function people(names: string[], shown = 2): string {
   return `${once.slice(0, shown).join(', ')} and ${once.length - shown} more`
 }
 
-/** A remark of the relay as a sentence: it begins with a capital and ends with a full stop. */
+/** A message of the relay as a sentence, with a capital letter and a full stop. */
 export function sentence(text: string): string {
   const trimmed = text.trim()
   const begun = trimmed.charAt(0).toUpperCase() + trimmed.slice(1)
@@ -101,7 +108,7 @@ const STRING_SHOWN = 120
 const LINES_SHOWN = 400
 const DEPTH_SHOWN = 24
 
-/** A message as indented JSON, with long arrays and strings cut short and the cut named. */
+/** A message as indented JSON. Long arrays and strings are shortened, with their full length. */
 export function pretty(message: unknown): string {
   const lines: string[] = []
   write(message, '', '', lines, 0)
@@ -111,7 +118,7 @@ export function pretty(message: unknown): string {
 
 function write(value: unknown, lead: string, tail: string, lines: string[], depth: number): void {
   const indent = '  '.repeat(depth)
-  // Past this, more lines would only be cut off again.
+  // Further lines would be cut off later.
   if (depth > DEPTH_SHOWN || lines.length > LINES_SHOWN * 4) {
     lines.push(`${indent}${lead}…${tail}`)
     return

@@ -6,6 +6,11 @@ it('reads the pages out of the address', () => {
   expect(parse('/fleet')).toEqual({ page: 'fleet' })
   expect(parse('/login')).toEqual({ page: 'login' })
   expect(parse('/alerts')).toEqual({ page: 'alerts' })
+  expect(parse('/pipes')).toEqual({ page: 'pipes' })
+  expect(parse('/diagram')).toEqual({ page: 'diagram' })
+  expect(parse('/functions')).toEqual({ page: 'functions' })
+  expect(parse('/files')).toEqual({ page: 'files', robot: '' })
+  expect(parse('/files/a%20b')).toEqual({ page: 'files', robot: 'a b' })
   expect(parse('/cockpit/rover-1')).toEqual({ page: 'cockpit', robot: 'rover-1' })
   expect(parse('/cockpit/%E0%A4%A')).toEqual({ page: 'unknown' })
   expect(parse('/elsewhere')).toEqual({ page: 'unknown' })
@@ -28,6 +33,10 @@ it('writes robot names so that they can be read back', () => {
 it('goes to a page of the portal after the login, nowhere else', () => {
   expect(afterLogin('?next=%2Fcockpit%2Frover-1')).toBe('/cockpit/rover-1')
   expect(afterLogin('?next=%2Falerts')).toBe('/alerts')
+  expect(afterLogin('?next=%2Fpipes')).toBe('/pipes')
+  expect(afterLogin('?next=%2Fdiagram')).toBe('/diagram')
+  expect(afterLogin('?next=%2Ffunctions')).toBe('/functions')
+  expect(afterLogin('?next=%2Ffiles%2Frover')).toBe('/files/rover')
   expect(afterLogin('?next=%2Frealm%2Frights')).toBe('/realm/rights')
   for (const next of ['https://evil.example/', '//evil.example/x', 'javascript:alert(1)', '/api/v1/session', '']) {
     expect(afterLogin(`?next=${encodeURIComponent(next)}`)).toBe('/fleet')

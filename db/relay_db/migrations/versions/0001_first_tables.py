@@ -1,4 +1,4 @@
-"""All tables of the first version.
+"""The tables of the first version.
 
 Revision ID: 0001
 Revises:
@@ -228,7 +228,7 @@ def downgrade() -> None:
 
 
 def _seed() -> None:
-    """The default realm, and the beginning of the audit chain: the hash of nothing."""
+    """The default realm, and the beginning of the audit chain: the hash of an empty text."""
     realm = sa.table("realm", sa.column("name", sa.String))
     op.bulk_insert(realm, [{"name": "default"}])
     revision_row = sa.table(

@@ -1,4 +1,4 @@
-"""Alerts, and the rules by which people are told of them.
+"""Alerts, and the rules by which users are notified of them.
 
 Revision ID: 0003
 Revises: 0002

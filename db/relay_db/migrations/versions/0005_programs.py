@@ -1,4 +1,4 @@
-"""Programs that prove themselves by key and secret, scopes of tokens, and tokens that are refreshed (OAuth 2.0).
+"""OAuth clients (table ``program``), scopes of tokens, and families of refreshed tokens.
 
 Revision ID: 0005
 Revises: 0004
@@ -78,7 +78,7 @@ def _to(table: str, column: str, other: str) -> sa.ForeignKeyConstraint:
 
 
 def _access_token() -> sa.Table:
-    """As it was: SQLite has it made anew, and nobody could read its checks out of the database."""
+    """The table before: SQLite creates it again, and its checks cannot be read from the database."""
     return sa.Table(
         "access_token",
         sa.MetaData(),

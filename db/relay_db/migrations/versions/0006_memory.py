@@ -1,4 +1,4 @@
-"""The short-term memory: events by source, kind, robot and user, numbered within each realm.
+"""Stored events (table ``memory``) by source, kind, robot and user, numbered within each realm.
 
 Revision ID: 0006
 Revises: 0005
@@ -21,7 +21,7 @@ INDICES = {
     "ix_memory_user": ("user_name", "at"),
     "ix_memory_robot": ("robot_id", "at"),
 }
-"""Each begins with the realm and ends with the number."""
+"""Each index begins with the realm and ends with the number."""
 
 
 def upgrade() -> None:

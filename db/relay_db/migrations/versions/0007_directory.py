@@ -1,4 +1,4 @@
-"""The directory: services and applications with their addresses, each for as long as its lease is renewed.
+"""The service registry: services and applications with addresses and leases.
 
 Revision ID: 0007
 Revises: 0006
@@ -22,7 +22,7 @@ INDICES = {
     "robot_id": ("robot_id",),
     "expires": ("expires",),
 }
-"""By the end of their names."""
+"""Columns of the indexes, by the end of their names."""
 
 
 def upgrade() -> None:

@@ -1,4 +1,4 @@
-"""How long each realm's memory keeps events.
+"""How long events of each realm are stored.
 
 Revision ID: 0008
 Revises: 0007

@@ -1,4 +1,4 @@
-"""Robots and users that are of several realms.
+"""Robots and users that belong to several realms.
 
 Revision ID: 0009
 Revises: 0008
@@ -53,7 +53,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    # Without their homes nobody could say whether guests may come in, nor whose password is theirs.
+    # Without the links it is unknown whether these accounts are disabled, and whose password they have.
     op.execute("DELETE FROM user_account WHERE id IN (SELECT user_id FROM guest_account)")
     other = (
         "DELETE FROM robot_right WHERE coalesce("
@@ -62,7 +62,7 @@ def downgrade() -> None:
         "<> (SELECT realm_id FROM robot WHERE id = robot_right.robot_id)"
     )
     op.execute(other)
-    # Nor is a robot of another realm to be named by groups and entries that were made while it was shared.
+    # Groups and entries from the time of sharing must not name a robot of another realm.
     home = "(SELECT realm_id FROM robot WHERE id = robot_id)"
     op.execute(
         f"DELETE FROM robot_membership WHERE (SELECT realm_id FROM robot_group WHERE id = group_id) <> {home}"

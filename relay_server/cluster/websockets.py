@@ -1,0 +1,401 @@
+"""A client's websocket whose robot is at another relay: messages go there one by one, and frames come back as they are.
+
+The robot's home pings the client through this relay, so it knows how old each message can be.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any, Protocol
+
+from autobahn.websocket.types import ConnectionRequest
+from twisted.internet.defer import Deferred
+from twisted.internet.protocol import Factory, connectionDone
+from twisted.internet.protocol import Protocol as TwistedProtocol
+from twisted.python.failure import Failure
+
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_server.access import BadCredentials
+from relay_server.cluster.forwarding import ForwardedClient, Forwarder, without_credentials
+from relay_server.cluster.relays import RelayInfo, check_compatible, unreachable
+from relay_server.common import close_codes
+from relay_server.common.clock import Clock
+from relay_server.common.concurrency import with_timeout
+from relay_server.common.send_queue import SendQueue
+from relay_server.common.tcp import PushProducer, enable_tcp_keepalive
+from relay_server.common.websocket_frames import BINARY, CLOSE, FIN, PING, PONG, TEXT, masked, parse_head
+from relay_server.sessions.ports import ClientTransport
+
+HEAD_BYTES = 16 * 1024
+"""Most bytes of the head of the home's answer."""
+
+OPEN_SECONDS = 5.0
+"""Seconds in which the home must answer the handshake."""
+
+MOST_PONGS = 16
+"""Most answers to pings that wait for the end of a fragmented message; the newest count."""
+
+UNSENT_BYTES = 4 << 20
+"""Most bytes that are written while the home takes none; more close the websocket."""
+
+_REFUSALS: dict[int, type[SwitchboardError]] = {
+    400: Invalid,
+    401: BadCredentials,
+    403: NotFound,
+    404: NotFound,
+}
+"""Errors for the statuses by which the home refuses a handshake; all others are :class:`Unavailable`."""
+
+
+@dataclass(frozen=True)
+class ForwardedHandshake:
+    """The handshake of a client, as it is repeated to the robot's home.
+
+    :param target: path and query, escaped, without tickets and tokens
+    :param protocols: that the client offered
+    :param origin: of a browser, or empty
+    """
+
+    target: str
+    protocols: Sequence[str]
+    origin: str
+
+    @classmethod
+    def of(cls, request: ConnectionRequest, target: str) -> ForwardedHandshake:
+        """The handshake of a request, without its credentials.
+
+        :param target: path and query as they came
+        """
+        protocols = [each for each in request.protocols if not each.startswith("bearer.")]
+        return cls(without_credentials(target), protocols, request.origin or "")
+
+    def request(self, host: str, fields: Mapping[str, str]) -> bytes:
+        """The request for the websocket (RFC 6455 section 4.1).
+
+        :param fields: more header fields
+        """
+        lines = [
+            f"GET {self.target} HTTP/1.1",
+            f"Host: {host}",
+            "Connection: Upgrade",
+            "Upgrade: websocket",
+            "Sec-WebSocket-Version: 13",
+            f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}",
+        ]
+        if self.protocols:
+            lines.append(f"Sec-WebSocket-Protocol: {', '.join(self.protocols)}")
+        if self.origin:
+            lines.append(f"Origin: {self.origin}")
+        lines += [f"{name}: {value}" for name, value in fields.items()]
+        return "\r\n".join([*lines, "", ""]).encode("ascii", "replace")
+
+
+class ForwardedWebSocket:
+    """The handler of a websocket that is forwarded (:class:`~relay_server.ws.handshake.WebSocketHandler`).
+
+    The client's own handshake is answered after the home's, so that no message is older than the home's session.
+
+    :param earliest_sent: see there; the home decides by its own measurement
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        forwarder: Forwarder,
+        relay: RelayInfo,
+        handshake: ForwardedHandshake,
+        client: ForwardedClient,
+        transport: ForwardedTransport,
+        earliest_sent: int,
+    ) -> None:
+        self.send_queue = SendQueue(transport.send, clock.seconds, _nothing)
+        self.earliest_sent = earliest_sent
+        self._clock = clock
+        self._forwarder = forwarder
+        self._relay = relay
+        self._handshake = handshake
+        self._client = client
+        self._transport = transport
+        self._home: _HomeConnection | None = None
+        self._pongs: list[bytes] = []
+        """Answers to pings that came between the fragments of a message. They follow it, as they do not date it."""
+        self._ended = False
+        self._paused_bytes: int | None = None
+        """Bytes sent to the home since it takes none; ``None``: it takes bytes."""
+        self._opening: Deferred[None] = Deferred()
+
+    async def open(self) -> None:
+        """Open the websocket to the home.
+
+        :raises Unavailable: it can't be reached, or refuses
+        """
+        check_compatible(self._relay)
+        factory = Factory.forProtocol(lambda: _HomeConnection(self))
+        connecting: Deferred[Any] = self._forwarder.endpoint(self._relay.host, self._relay.port).connect(
+            factory
+        )
+        connecting.addErrback(self._not_connected)
+        late = f"the relay that the robot is connected to did not answer in time ({self._relay.address})"
+        try:
+            await with_timeout(self._clock, OPEN_SECONDS, self._opening, late)
+        except BaseException:
+            connecting.cancel()
+            self.end()
+            raise
+
+    def start(self) -> None:
+        """The client's websocket is open: frames of the home may follow."""
+        assert self._home is not None
+        self._home.transport.registerProducer(PushProducer(_HomeFlow(self)), True)
+        self._forwarder.websockets.add(self)
+        self._home.start()
+
+    def message(self, payload: bytes, *, earliest_sent: int | None = None) -> None:
+        """Forward a text message."""
+        self._send(masked(TEXT, payload))
+
+    def binary_message(self, payload: bytes, *, earliest_sent: int) -> None:
+        """Forward a binary message."""
+        self._send(masked(BINARY, payload))
+
+    def ping(self) -> None:
+        """The home pings."""
+
+    def client_ping(self, payload: bytes) -> None:
+        """Forward a ping of the client; the home answers it."""
+        self._send(masked(PING, payload))
+
+    def pong(self, payload: bytes) -> None:
+        """Forward the answer to a ping of the home."""
+        frame = masked(PONG, payload)
+        if self._transport.inside_message:
+            self._pongs = [*self._pongs[1 - MOST_PONGS :], frame]
+        else:
+            self._send(frame)
+
+    def pause(self) -> None:
+        """The client does not read, so the home is not read either."""
+        if self._home is not None:
+            self._home.transport.pauseProducing()
+
+    def resume(self) -> None:
+        """Read the home again."""
+        if self._home is not None:
+            self._home.transport.resumeProducing()
+
+    def close(self, code: int, reason: str) -> None:
+        """Close the client's websocket, and end."""
+        if self._home is not None and self._home.inside_frame:
+            # A close frame would be taken for a part of that frame.
+            self._transport.dropConnection(abort=True)
+        elif self._home is not None and self._home.inside_message:
+            # Only a control frame may follow a part of a message (RFC 6455 section 5.4).
+            self._transport.close(code, reason, farewell=b"")
+        else:
+            self._transport.close(code, reason)
+        self.end()
+
+    def end(self, *, orderly: bool = False) -> None:
+        """The client's websocket is closed."""
+        if self._ended:
+            return
+        self._ended = True
+        self._forwarder.websockets.discard(self)
+        if self._home is None:
+            return
+        if orderly:
+            self._home.transport.write(masked(CLOSE, struct.pack("!H", 1000)))
+            self._home.transport.unregisterProducer()
+            self._home.transport.loseConnection()
+        else:
+            self._home.transport.abortConnection()
+
+    def _send(self, frame: bytes) -> None:
+        if self._ended or self._home is None:
+            return
+        pongs, self._pongs = self._pongs, []
+        self._home.transport.write(b"".join([frame, *pongs]))
+        if self._paused_bytes is not None:
+            self._paused_bytes += len(frame)
+            if self._paused_bytes > UNSENT_BYTES:
+                self.close(close_codes.UNAVAILABLE, "the robot's relay takes no messages; connect again")
+
+    # --- flow to the home ---------------------------------------------------------------------------------
+
+    def home_paused(self) -> None:
+        """The home takes no bytes, so the client is not read."""
+        self._paused_bytes = 0
+        self._transport.transport.pauseProducing()
+
+    def home_resumed(self) -> None:
+        """The home takes bytes again."""
+        self._paused_bytes = None
+        self._transport.transport.resumeProducing()
+
+    # --- the home -----------------------------------------------------------------------------------------
+
+    def connected(self, home: _HomeConnection) -> None:
+        """The home accepts connections."""
+        if self._ended:
+            home.transport.abortConnection()
+            return
+        self._home = home
+        fields = self._forwarder.headers(self._client)
+        home.transport.write(self._handshake.request(self._relay.address, fields))
+
+    def accepted(self) -> None:
+        """The home has answered the handshake. Its frames wait for :meth:`start`."""
+        if not self._opening.called:
+            self._opening.callback(None)
+
+    def refused(self, status: int) -> None:
+        """The home has refused the handshake."""
+        words = HTTPStatus(status).phrase if status in HTTPStatus._value2member_map_ else "refused"
+        self._fail(
+            f"the relay that the robot is connected to answered {status} {words}",
+            _REFUSALS.get(status, Unavailable),
+        )
+
+    def frames(self, data: bytes) -> None:
+        """Bytes of frames for the client."""
+        if not self._ended:
+            self._transport.send(data)
+
+    def closed(self, code: int, reason: str) -> None:
+        """The home closes the websocket. What it has to say to the client before that was forwarded."""
+        if not self._opening.called:
+            self._fail(reason)
+        elif not self._ended:
+            self._transport.close(code, reason, farewell=b"")
+            self.end()
+
+    def lost(self) -> None:
+        """The home is gone."""
+        reason = "the connection to the robot's relay is lost; connect again"
+        if not self._opening.called:
+            self._fail(reason)
+        elif not self._ended:
+            self.close(close_codes.UNAVAILABLE, reason)
+
+    def _fail(self, reason: str, kind: type[SwitchboardError] = Unavailable) -> None:
+        if not self._opening.called:
+            self._opening.errback(kind(reason))
+
+    def _not_connected(self, failure: Failure) -> None:
+        self._fail(str(unreachable(self._relay)))
+
+
+class ForwardedTransport(ClientTransport, Protocol):
+    """The websocket of the client."""
+
+    transport: Any
+    """Its connection."""
+
+    def dropConnection(self, abort: bool = False) -> None:
+        """End the connection without a close frame."""
+
+    inside_message: bool
+    """Whether some fragments of a message have come, and not all."""
+
+
+class _HomeFlow:
+    """The flow of bytes to the home."""
+
+    def __init__(self, session: ForwardedWebSocket) -> None:
+        self.pause = session.home_paused
+        self.resume = session.home_resumed
+
+
+class _HomeConnection(TwistedProtocol):
+    """The connection to the home: the head of its answer, then frames. Only the last one, a close frame, is read."""
+
+    transport: Any
+
+    def __init__(self, client: ForwardedWebSocket) -> None:
+        self._accepted = False
+        self._started = False
+        self._client = client
+        self._head = b""
+        self._unparsed = b""
+        self._left = 0
+        """Bytes that are left of the frame whose head was passed on."""
+        self.inside_message = False
+        """Whether the client has some fragments of a message, and not all."""
+
+    @property
+    def inside_frame(self) -> bool:
+        """Whether the client has a part of a frame."""
+        return self._left > 0
+
+    def connectionMade(self) -> None:
+        enable_tcp_keepalive(self.transport)
+        self._client.connected(self)
+
+    def dataReceived(self, data: bytes) -> None:
+        if self._started:
+            self._frames(data)
+            return
+        self._head += data
+        if self._accepted:
+            return
+        head, end, rest = self._head.partition(b"\r\n\r\n")
+        if not end:
+            if len(self._head) > HEAD_BYTES:
+                self._client.refused(HTTPStatus.BAD_GATEWAY)
+            return
+        status = head.split(b" ", 2)[1:2]
+        if status != [b"101"]:
+            self._client.refused(int(status[0]) if status and status[0].isdigit() else HTTPStatus.BAD_GATEWAY)
+            return
+        self._accepted = True
+        self._head = rest
+        self.transport.pauseProducing()
+        self._client.accepted()
+
+    def start(self) -> None:
+        """Pass frames on from now on."""
+        self._started = True
+        rest, self._head = self._head, b""
+        self._frames(rest)
+        self.transport.resumeProducing()
+
+    def _frames(self, data: bytes) -> None:
+        """Pass frames on, and stop at a close frame."""
+        data = self._unparsed + data
+        at, size = min(self._left, len(data)), len(data)
+        self._left -= at
+        while at < size:
+            head = parse_head(data, at)
+            if head is None:
+                break
+            first, length, start = head
+            if first == CLOSE:
+                if start + length > size:
+                    break
+                self._client.frames(data[:at])
+                self._closed(data[start : start + length])
+                return
+            if first & 15 < CLOSE & 15:
+                self.inside_message = not first & FIN
+            end = start + length
+            self._left = max(0, end - size)
+            at = min(end, size)
+        self._unparsed = data[at:]
+        if at:
+            self._client.frames(data[:at])
+
+    def _closed(self, payload: bytes) -> None:
+        code = int.from_bytes(payload[:2], "big") if len(payload) > 1 else 1000
+        self._client.closed(code, payload[2:].decode("utf-8", "replace"))
+
+    def connectionLost(self, reason: Failure = connectionDone) -> None:
+        self._client.lost()
+
+
+def _nothing() -> None:
+    """Nothing waits in the queue of a forwarded websocket."""

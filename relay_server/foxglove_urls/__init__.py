@@ -1,0 +1,1 @@
+"""URLs with a token, by which Foxglove and Lichtblick open one robot."""

@@ -1,0 +1,127 @@
+"""Processes that run calls, each one at a time. A time limit and a cancel kill the process of the call.
+
+The embedded engine has them on the relay's machine, and ``switchboard worker`` on its own.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from pebble import ProcessExpired, ProcessPool
+
+from relay_protocol.errors import Unavailable
+from relay_server.offload.runner import (
+    Outcome,
+    WorkerCall,
+    WorkerFunctions,
+    describe_functions,
+    run_call,
+    start_process,
+)
+
+DESCRIBE_SECONDS = 60.0
+"""Longest time in which a new process loads the functions."""
+
+
+class CallProcesses:
+    """A pool of processes; they start with the first call. Threads may share it.
+
+    :param processes: calls that run at a time
+    :param folder: of further functions, or ``None``
+    :ivar progress_socket: path at which the owner listens for datagrams with the progress
+    """
+
+    def __init__(self, processes: int, folder: Path | None = None) -> None:
+        self._processes = processes
+        self._folder = folder
+        self._sockets = Path(tempfile.mkdtemp(prefix="switchboard-"))
+        self.progress_socket = str(self._sockets / "progress")
+        self._lock = threading.Lock()
+        self._pool: ProcessPool | None = None
+
+    def describe(self) -> Future[bytes]:
+        """:class:`WorkerFunctions` as MessagePack; see :func:`functions_of`."""
+        return self._schedule(describe_functions, (), DESCRIBE_SECONDS)
+
+    def run(self, call: WorkerCall, seconds: float) -> Future[bytes]:
+        """Run a call. Its future has an :class:`Outcome` as MessagePack, or an error for :func:`outcome_of`.
+
+        :param seconds: longest run
+        """
+        return self._schedule(run_call, (msgspec.msgpack.encode(call),), seconds)
+
+    def stop(self) -> None:
+        """Kill all processes, and wait for their ends."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.stop()
+            pool.join()
+        shutil.rmtree(self._sockets, ignore_errors=True)
+
+    def _schedule(
+        self, work: Callable[..., bytes], arguments: tuple[Any, ...], seconds: float
+    ) -> Future[bytes]:
+        with self._lock:
+            if self._pool is None or not self._pool.active:
+                self._pool = ProcessPool(
+                    self._processes,
+                    initializer=start_process,
+                    initargs=(str(self._folder or ""), self.progress_socket),
+                    # A fork would take the owner's sockets and locks with it.
+                    context=multiprocessing.get_context("spawn"),
+                )
+            future: Future[bytes] = self._pool.schedule(work, args=arguments, timeout=seconds)
+            return future
+
+
+def functions_of(body: bytes) -> WorkerFunctions:
+    """Functions as a process has described them.
+
+    :raises Unavailable: this is no description
+    """
+    try:
+        return msgspec.msgpack.decode(body, type=WorkerFunctions)
+    except msgspec.DecodeError as error:
+        raise no_functions(error) from None
+
+
+def no_functions(error: BaseException) -> Unavailable:
+    """For a process that could not describe its functions."""
+    return Unavailable(f"the functions can't be loaded: {error or type(error).__name__}")
+
+
+def outcome_of(name: str, seconds: float, error: BaseException) -> Outcome:
+    """How a call ended that has no outcome of its own.
+
+    :param seconds: its time limit
+    """
+    if isinstance(error, FutureTimeout):
+        return too_long(name, seconds)
+    if isinstance(error, CancelledError):
+        return cancelled(name)
+    if isinstance(error, ProcessExpired):
+        return Outcome(
+            code="crashed", error=f"function {name} ended its process (exit code {error.exitcode})"
+        )
+    return Outcome(code="crashed", error=f"function {name}: {type(error).__name__}: {error}")
+
+
+def too_long(name: str, seconds: float) -> Outcome:
+    """The outcome of a call that was ended at its time limit."""
+    words = f"function {name} ran longer than {seconds:g} s and was ended"
+    return Outcome(code="timeout", error=words, seconds=seconds)
+
+
+def cancelled(name: str) -> Outcome:
+    """The outcome of a call that was cancelled."""
+    return Outcome(code="cancelled", error=f"the call of function {name} was cancelled")

@@ -1,0 +1,1 @@
+"""Pipes: a topic of one robot is carried to a topic of another, or of the same one."""

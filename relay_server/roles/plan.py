@@ -1,0 +1,160 @@
+"""The parts of a Role that start with it: modules, programs, devices, pipes, and pipes for mappings.
+
+A mapping joins topics and ports of programs, or fields of them with arguments and fields of the replies of services,
+and with fields of goals and of their results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import msgspec
+
+from relay_protocol.errors import Invalid
+from relay_server.pipes.schemas import FieldMapping, NewPipe, PipeEnd
+from relay_server.roles.bindings import Binding, binding_of, field_path
+from relay_server.roles.schemas import RoleElement
+
+SOFTWARE = frozenset({"process", "software", "softwareElement"})
+"""Elements of these types are switched on with their Role, if they are bound to a device. Data never is."""
+
+MAX_PARTS = 200
+
+
+class RolePart(msgspec.Struct):
+    """A part of a Role that was started.
+
+    :param element: its name; of a mapping, both names
+    :param resource: as the document has it, or the pipe of a mapping
+    :param mapped: whether the pipe was made for a mapping, so that it is removed with the Role's end
+    :param new: of a mapping, the pipe as JSON
+    :param error: why it was not started, or not stopped
+    :param still_runs: whether it could not be stopped, but a second stop may succeed
+    """
+
+    element: str
+    resource: str
+    mapped: bool = False
+    new: str = ""
+    error: str = ""
+    still_runs: bool = False
+
+    @property
+    def binding(self) -> Binding:
+        """The resource."""
+        found = binding_of(self.resource)
+        assert found is not None
+        return found
+
+    @property
+    def robots(self) -> list[str]:
+        """Names of the robots that it concerns, as far as the Role has them."""
+        if self.new:
+            pipe = msgspec.json.decode(self.new, type=NewPipe)
+            return [each.robot for each in (pipe.source, pipe.target) if each.robot]
+        return [self.binding.robot] if self.binding.robot else []
+
+
+def plan_of(role_id: int, elements: Iterable[RoleElement]) -> list[RolePart]:
+    """The parts of a Role, in the order of starting.
+
+    :raises Invalid: there are too many
+    """
+    elements = list(elements)
+    parts = [
+        *_of_kind(elements, "modules"),
+        *_of_kind(elements, "programs"),
+        *_devices(elements),
+        *_of_kind(elements, "pipes"),
+    ]
+    seen: dict[str, RolePart] = {}
+    for each in parts:
+        seen.setdefault(each.resource, each)
+    parts = [*seen.values(), *_mappings(role_id, elements)]
+    if len(parts) > MAX_PARTS:
+        raise Invalid(f"the Role has {len(parts)} parts to start; {MAX_PARTS} are allowed")
+    return parts
+
+
+def _of_kind(elements: Iterable[RoleElement], kind: str) -> Iterator[RolePart]:
+    for each in elements:
+        for binding in _bindings(each):
+            if binding.kind == kind:
+                yield RolePart(each.name, binding.text)
+
+
+def _devices(elements: Iterable[RoleElement]) -> Iterator[RolePart]:
+    for each in elements:
+        for binding in _bindings(each):
+            if SOFTWARE.intersection(each.types) and binding.kind in ("services", "topics"):
+                yield RolePart(each.name, binding.text)
+
+
+def _mappings(role_id: int, elements: list[RoleElement]) -> Iterator[RolePart]:
+    """A pipe for each pair of topics, ports or services with mappings from one to the other."""
+    by_name = {each.name: each for each in elements}
+    pairs: dict[tuple[tuple[str, str, str], ...], list[tuple[str, Binding, Binding]]] = {}
+    for each in elements:
+        for name in each.mappings:
+            for source in _ends(each):
+                for target in _ends(by_name.get(name)):
+                    key = tuple((end.robot, end.kind, end.name) for end in (source, target))
+                    if key[0] != key[1]:
+                        pairs.setdefault(key, []).append((f"{each.name} → {name}", source, target))
+    for number, mapped in enumerate(pairs.values(), 1):
+        yield _pipe_part(f"role-{role_id}-{number}", mapped)
+
+
+def _pipe_part(name: str, mapped: list[tuple[str, Binding, Binding]]) -> RolePart:
+    element = ", ".join(each for each, _, _ in mapped)
+    part = RolePart(element, f"pipes/{name}", mapped=True)
+    _, source, target = mapped[0]
+    whole = [not (a.pointer or b.pointer) for _, a, b in mapped]
+    paths = [[_path(end) for end in ends] for _, *ends in mapped]
+    if not all(whole) and not all(map(all, paths)):
+        part.error = "a field can't be mapped to a whole message; map a field to a field"
+        return part
+    fields = [] if all(whole) else [FieldMapping(a, b) for a, b in paths]
+    new = NewPipe(
+        name=name,
+        source=_pipe_end(source),
+        target=_pipe_end(target),
+        fields=fields,
+    )
+    part.new = msgspec.json.encode(new).decode()
+    try:
+        msgspec.json.decode(part.new, type=NewPipe)
+    except msgspec.ValidationError as error:
+        part.new, part.error = "", f"this can't be mapped: {error}"
+    return part
+
+
+def _path(binding: Binding) -> str:
+    """The field of a binding; of a port as a whole its only one."""
+    return field_path(binding) or ("data" if binding.kind == "ports" else "")
+
+
+def _pipe_end(binding: Binding) -> PipeEnd:
+    if binding.kind == "ports":
+        program, _, port = binding.name.partition("/")
+        return PipeEnd(program=program, port=port)
+    name = binding.name if binding.name.startswith("/") else f"/{binding.name}"
+    return PipeEnd(binding.robot, **{binding.kind.removesuffix("s"): name})
+
+
+def _ends(element: RoleElement | None) -> list[Binding]:
+    """A mapping can carry topics, ports and fields of services and actions. Only commands call these as a whole."""
+    if element is None:
+        return []
+    return [
+        each
+        for each in _bindings(element)
+        if each.kind in ("topics", "ports") or (each.kind in ("services", "actions") and each.pointer)
+    ]
+
+
+def _bindings(element: RoleElement) -> Iterator[Binding]:
+    for each in element.resources:
+        binding = binding_of(each)
+        if binding is not None:
+            yield binding

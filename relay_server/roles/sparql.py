@@ -1,0 +1,308 @@
+"""SPARQL over the Roles of one realm: the graph in memory, resolution of elements, and queries of clients.
+
+Each Role is a named graph, ``fierro:`` and its name. Runs in the process of :mod:`relay_server.roles.worker`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from itertools import chain, islice
+from typing import Any
+from xml.sax.saxutils import escape, quoteattr
+
+from pyoxigraph import (
+    BlankNode,
+    Literal,
+    NamedNode,
+    QueryBoolean,
+    QuerySolutions,
+    RdfFormat,
+    Store,
+    parse,
+    serialize,
+)
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Invalid
+from relay_server.roles.vocabulary import FIERRO, PREFIXES, RDF_TYPE, SWITCHBOARD, TYPES
+
+RESULTS_JSON = "application/sparql-results+json"
+RESULTS_XML = "application/sparql-results+xml"
+RESULTS_CSV = "text/csv"
+TURTLE = "text/turtle"
+
+GRAPH_FORMATS = {
+    TURTLE: RdfFormat.TURTLE,
+    "application/rdf+xml": RdfFormat.RDF_XML,
+    "application/ld+json": RdfFormat.JSON_LD,
+    "application/n-triples": RdfFormat.N_TRIPLES,
+}
+
+MAX_ROWS = 10_000
+MAX_BINDINGS = 100
+"""Resources of one element."""
+
+MAX_RESULT = 4 * 1024 * 1024
+"""Bytes."""
+
+_XSD_STRING = "http://www.w3.org/2001/XMLSchema#string"
+
+_OWNERS = "|".join(f"^fierro:{each}" for each in sorted(TYPES - {"mapping", "role"}))
+_STEP = f"fierro:mapping|^fierro:mapping|{_OWNERS}"
+_REACHED = f"""PREFIX fierro: <fierro:>
+SELECT DISTINCT ?item WHERE {{ <%s> ({_STEP})+ ?item }} LIMIT {MAX_ROWS}"""
+_RESOLVE = f"""PREFIX fierro: <fierro:>
+SELECT DISTINCT ?role WHERE {{
+  <%s> ({_STEP})+ ?role
+  FILTER EXISTS {{ ?role a fierro:role }}
+}} LIMIT {MAX_ROWS}"""
+"""From an element over mappings, and up to what has it, to its Roles. As a join of the type with the path, the
+same query takes a thousand times longer: Oxigraph would begin at all Roles."""
+
+
+_BINDINGS = f"""PREFIX fierro: <fierro:> PREFIX switchboard: <switchboard:>
+SELECT DISTINCT ?item ?resource WHERE {{
+  <%s> (fierro:mapping|^fierro:mapping)* ?item . ?item switchboard:resource ?resource
+}} LIMIT {MAX_BINDINGS}"""
+
+
+class RoleGraphs:
+    """The Roles of one realm."""
+
+    def __init__(self) -> None:
+        self._store = Store()
+
+    def put(self, name: str, document: str) -> None:
+        """Add a Role, or replace it.
+
+        :param document: in N-Triples
+        """
+        graph = graph_of(name)
+        self._store.remove_graph(graph)
+        self._store.extend(
+            quad
+            for quad in parse(document, format=RdfFormat.N_TRIPLES, rename_blank_nodes=True)
+            for quad in [type(quad)(quad.subject, quad.predicate, quad.object, graph)]
+        )
+
+    def drop(self, name: str) -> None:
+        """Remove a Role."""
+        self._store.remove_graph(graph_of(name))
+
+    def roles_of(self, element: str, names: Sequence[str] | None) -> list[str]:
+        """The Roles that an element belongs to, itself or by what is mapped to it, as IRIs.
+
+        :param element: its IRI
+        :param names: of the Roles that may be used; ``None`` for all
+        """
+        element = _checked_iri(element)
+        if names is not None:
+            names = self._touched(element, set(names))
+        found: Any = self._store.query(_RESOLVE % element, **_dataset(names))
+        return [each["role"].value for each in found]
+
+    def bindings(self, element: str, name: str) -> list[tuple[str, str]] | None:
+        """Resources of an element, and of those that are mapped to it within a Role: pairs of element and resource.
+
+        :param element: its IRI
+        :param name: of the Role
+        :returns: ``None`` if the Role has no such element
+        """
+        element, graph = _checked_iri(element), graph_of(name)
+        node = NamedNode(element)
+        known = chain(
+            self._store.quads_for_pattern(node, None, None, graph),
+            self._store.quads_for_pattern(None, None, node, graph),
+        )
+        if next(known, None) is None:
+            return None
+        found: Any = self._store.query(_BINDINGS % element, **_dataset([name]))
+        return [(each["item"].value, each["resource"].value) for each in found]
+
+    def elements(self, name: str) -> list[dict[str, Any]]:
+        """Named elements of a Role: IRI, types without their namespace, resources, and what they are mapped to."""
+        found: dict[str, dict[str, Any]] = {}
+
+        def element(term: Any) -> dict[str, Any]:
+            new = {"iri": term.value, "types": [], "resources": [], "mappings": []}
+            return found.setdefault(term.value, new)
+
+        quads = self._store.quads_for_pattern(None, None, None, graph_of(name))
+        for subject, predicate, value, _ in sorted(quads, key=str):
+            if not isinstance(subject, NamedNode):
+                continue
+            if predicate.value == f"{SWITCHBOARD}resource":
+                element(subject)["resources"].append(value.value)
+            elif predicate.value == RDF_TYPE:
+                element(subject)["types"].append(value.value.removeprefix(FIERRO))
+            elif isinstance(value, NamedNode) and predicate.value.startswith(FIERRO):
+                kind = predicate.value.removeprefix(FIERRO)
+                if kind == "mapping":
+                    element(subject)["mappings"].append(value.value)
+                elif kind not in element(value)["types"]:
+                    # The property that leads to a resource has the name of its type.
+                    element(value)["types"].append(kind)
+        return [each for iri, each in found.items() if iri != graph_of(name).value]
+
+    def _touched(self, element: str, names: set[str]) -> list[str]:
+        """Those of the Roles with a statement about the element, or about something that it leads to.
+
+        A path over few graphs is quick; over all that a user may see, Oxigraph looks into each graph at each step. A
+        step's statement has a subject that the path reaches, so no Role that matters is left out.
+        """
+        reached: Any = self._store.query(_REACHED % element, use_default_graph_as_union=True)
+        items = [NamedNode(element), *(each["item"] for each in reached)]
+        if len(items) > MAX_ROWS:
+            return sorted(names)
+        found = {
+            _role_of(quad.graph_name)
+            for each in items
+            for quad in self._store.quads_for_pattern(each, None, None, None)
+        }
+        return sorted(found & names)
+
+    def query(
+        self, text: str, names: Sequence[str] | None, rows_media: str, graph_media: str
+    ) -> tuple[str, bytes]:
+        """Carry out a query of a client: media type and body of its result.
+
+        :param names: of the Roles that the client may see; ``None`` for all
+        :param rows_media: for SELECT and ASK
+        :param graph_media: for CONSTRUCT and DESCRIBE
+        :raises Invalid: it is not valid, or has too many results
+        """
+        try:
+            result = self._store.query(text, prefixes=PREFIXES, **_dataset(names))
+            if isinstance(result, QueryBoolean):
+                body = _boolean(bool(result), rows_media)
+                # CSV has no form for it (SPARQL 1.1 Query Results CSV, section 1).
+                return (RESULTS_JSON if rows_media == RESULTS_CSV else rows_media), body
+            if isinstance(result, QuerySolutions):
+                header = [each.value for each in result.variables]
+                return rows_media, _WRITERS[rows_media](header, _bounded(result, "rows"))
+            triples = _bounded(result, "statements")
+        except (SyntaxError, ValueError, OSError) as error:
+            raise Invalid(f"the query was not carried out: {str(error)[:300]}") from None
+        prefixes = None if graph_media == "application/ld+json" else PREFIXES
+        return graph_media, _fits(
+            serialize(triples, format=GRAPH_FORMATS[graph_media], prefixes=prefixes) or b""
+        )
+
+
+def graph_of(name: str) -> NamedNode:
+    """The named graph of a Role."""
+    return NamedNode(f"{FIERRO}{name}")
+
+
+def _checked_iri(text: str) -> str:
+    """:raises Invalid: it is no IRI, or would end the one in a query"""
+    try:
+        text = NamedNode(text).value
+    except ValueError as error:
+        raise Invalid(f"'{text[:60]}' is no IRI: {error}") from None
+    if any(each in text for each in '<>"{}|^`\\ \n'):
+        raise Invalid(f"'{text[:60]}' is no IRI")
+    return text
+
+
+def _role_of(graph: Any) -> str:
+    """The Role of a named graph."""
+    return str(graph.value).removeprefix(FIERRO)
+
+
+def _dataset(names: Sequence[str] | None) -> dict[str, Any]:
+    if names is None:
+        return {"use_default_graph_as_union": True}
+    graphs = [graph_of(each) for each in names]
+    return {"default_graph": graphs, "named_graphs": graphs}
+
+
+def _bounded(results: Iterable[Any], what: str) -> list[Any]:
+    found = list(islice(results, MAX_ROWS + 1))
+    if len(found) > MAX_ROWS:
+        raise Invalid(f"the result has more than {MAX_ROWS} {what}; add LIMIT to the query")
+    return found
+
+
+def _fits(body: bytes) -> bytes:
+    if len(body) > MAX_RESULT:
+        raise Invalid(f"the result has more than {MAX_RESULT} bytes; add LIMIT to the query, or ask for less")
+    return body
+
+
+# --- forms of results -------------------------------------------------------------------------------------
+
+
+def _boolean(value: bool, media: str) -> bytes:
+    if media == RESULTS_XML:
+        word = str(value).lower()
+        return f"{_XML_HEAD}<head></head><boolean>{word}</boolean></sparql>".encode()
+    return jsontext.encode({"head": {}, "boolean": value})
+
+
+def _json(header: list[str], rows: list[Any]) -> bytes:
+    bindings = [{name: _term(row[name]) for name in header if row[name] is not None} for row in rows]
+    return _fits(jsontext.encode({"head": {"vars": header}, "results": {"bindings": bindings}}))
+
+
+def _term(term: Any) -> dict[str, Any]:
+    """SPARQL 1.1 Query Results JSON Format, section 3.2.2."""
+    if isinstance(term, NamedNode):
+        return {"type": "uri", "value": term.value}
+    if isinstance(term, BlankNode):
+        return {"type": "bnode", "value": term.value}
+    if not isinstance(term, Literal):
+        raise Invalid("the result has a statement as a value; ask for its parts")
+    found: dict[str, Any] = {"type": "literal", "value": term.value}
+    if term.language:
+        found["xml:lang"] = term.language
+    elif term.datatype.value != _XSD_STRING:
+        found["datatype"] = term.datatype.value
+    return found
+
+
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML 1.0 has no form for."""
+
+_XML_HEAD = '<?xml version="1.0"?>\n<sparql xmlns="http://www.w3.org/2005/sparql-results#">'
+
+
+def _xml(header: list[str], rows: list[Any]) -> bytes:
+    out = [
+        _XML_HEAD,
+        "<head>",
+        *(f"<variable name={quoteattr(each)}/>" for each in header),
+        "</head><results>",
+    ]
+    for row in rows:
+        out.append("<result>")
+        for name in header:
+            if row[name] is not None:
+                out.append(f"<binding name={quoteattr(name)}>{_xml_term(_term(row[name]))}</binding>")
+        out.append("</result>")
+    return _fits("".join([*out, "</results></sparql>"]).encode())
+
+
+def _xml_term(term: dict[str, Any]) -> str:
+    kind, value = term["type"], escape(_NOT_XML.sub("\ufffd", term["value"]))
+    more = "".join(f" {each}={quoteattr(term[each])}" for each in ("xml:lang", "datatype") if each in term)
+    return f"<{kind}{more}>{value}</{kind}>"
+
+
+def _csv(header: list[str], rows: list[Any]) -> bytes:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\r\n")
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow(["" if row[each] is None else _csv_term(row[each]) for each in header])
+    return _fits(out.getvalue().encode())
+
+
+def _csv_term(term: Any) -> str:
+    return f"_:{term.value}" if isinstance(term, BlankNode) else str(_term(term)["value"])
+
+
+_WRITERS = {RESULTS_JSON: _json, RESULTS_XML: _xml, RESULTS_CSV: _csv}

@@ -1,0 +1,1 @@
+"""The service registry: leased entries of services and applications (SPEC 1.15)."""

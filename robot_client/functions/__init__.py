@@ -1,0 +1,1 @@
+"""Functions that ship: workers find them as entry points, programs on the robot call them directly."""

@@ -1,0 +1,228 @@
+"""Calls functions on the relay's workers, over a link of its own that is dialled with the first call."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_protocol.function_link import (
+    MAX_WAIT,
+    CallFunction,
+    CancelFunction,
+    FetchResult,
+    FunctionReply,
+)
+from relay_protocol.functions import CallFailed, decode_value, encode_value
+from relay_protocol.limits import FUNCTION_BYTES
+from robot_client.link.enrolment import StateFolder
+from robot_client.offload.device import state_folder
+from robot_client.offload.function_link import FunctionConnection, Reply
+
+CALL_SECONDS = 10.0
+"""Default time for a call."""
+
+RETRY_SECONDS = 2.0
+"""After a failed attempt to reach the relay, calls fail at once for so long."""
+
+DONE = frozenset({"done", "failed", "cancelled", "refused"})
+
+
+class Cloud:
+    """The relay's workers, for one robot. Threads may share it.
+
+    :param folder: the robot's state folder; without it, as ``SWITCHBOARD_ROBOT_STATE`` says
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self._folder = folder
+        self._lock = threading.Lock()
+        self._connection: FunctionConnection | None = None
+        self._failed_at = -RETRY_SECONDS
+        self._failure = ""
+
+    def call(
+        self,
+        function: str,
+        /,
+        *,
+        timeout: float = CALL_SECONDS,
+        version: int | None = None,
+        newest: bool = False,
+        **arguments: Any,
+    ) -> Any:
+        """Run a function and wait for its result.
+
+        :param timeout: seconds, for everything
+        :param newest: while a call of this function is under way, the next one waits, and gives way to a newer one.
+            So a slow uplink carries the newest frame
+        :raises CallFailed: there is no result; the code says why. After ``lost`` and ``timeout`` it may have run
+        :raises Unavailable: the relay or its workers can't be reached; it did not run
+        """
+        request = CallFunction(
+            function=function, arguments=_encode(arguments), version=version, deadline=timeout
+        )
+        began = time.monotonic()
+        reply = self._begin(request, newest=function if newest else "")
+        return result_of(_wait(reply.future, timeout - (time.monotonic() - began), function))
+
+    def submit(
+        self,
+        function: str,
+        /,
+        *,
+        deadline: float | None = None,
+        version: int | None = None,
+        key: str = "",
+        **arguments: Any,
+    ) -> Handle:
+        """Have a function run, and do not wait. The result is kept until it is fetched, for a day.
+
+        :param deadline: seconds until which it must have ended; an hour by default
+        :param key: a repeated submit with this key runs once
+        :raises Unavailable: the relay can't be reached
+        """
+        request = CallFunction(
+            function=function,
+            arguments=_encode(arguments),
+            version=version,
+            deadline=deadline,
+            keep=True,
+            key=key,
+        )
+        return Handle(self, self._begin(request).future)
+
+    def handle(self, job: str) -> Handle:
+        """A job by its id, such as one of an earlier run of this program."""
+        known: Future[FunctionReply] = Future()
+        known.set_result(FunctionReply(job=job, state="queued"))
+        return Handle(self, known)
+
+    def ask(self, request: CancelFunction | FetchResult, timeout: float) -> FunctionReply:
+        """Ask about a job.
+
+        :raises CallFailed: no answer came in time, or the link was lost
+        :raises Unavailable: the relay can't be reached
+        """
+        return _wait(self._begin(request).future, timeout, "")
+
+    def close(self) -> None:
+        """Close the link. Calls that run fail."""
+        with self._lock:
+            if self._connection is not None:
+                self._connection.close("the program has closed the link")
+            self._connection = None
+
+    def _begin(self, request: CallFunction | CancelFunction | FetchResult, newest: str = "") -> Reply:
+        return self._connected().begin(msgspec.msgpack.encode(request), newest)
+
+    def _connected(self) -> FunctionConnection:
+        with self._lock:
+            if self._connection is not None and self._connection.open:
+                return self._connection
+            if time.monotonic() - self._failed_at < RETRY_SECONDS:
+                raise Unavailable(self._failure)
+            try:
+                self._connection = self._dial()
+            except SwitchboardError as error:
+                self._failed_at, self._failure = time.monotonic(), str(error)
+                raise Unavailable(self._failure) from None
+            return self._connection
+
+    def _dial(self) -> FunctionConnection:
+        folder = self._folder or state_folder()
+        if folder is None:
+            raise Unavailable("set SWITCHBOARD_ROBOT_STATE to the robot's state folder")
+        enrolment, identity = StateFolder(folder).load()
+        return FunctionConnection(enrolment, identity)
+
+
+class Handle:
+    """A job that was submitted."""
+
+    def __init__(self, client: Cloud, begun: Future[FunctionReply]) -> None:
+        self._cloud = client
+        self._begun = begun
+
+    def id(self, timeout: float = CALL_SECONDS) -> str:
+        """The id of the job, as soon as the relay has confirmed it.
+
+        :raises CallFailed: the relay has refused it, or did not answer
+        """
+        reply = _wait(self._begun, timeout, "")
+        if reply.state == "refused":
+            raise CallFailed(reply.code, reply.error)
+        return reply.job
+
+    def status(self, wait: float = 0.0) -> FunctionReply:
+        """The state of the job, after waiting for its end for so many seconds.
+
+        :raises CallFailed: no answer
+        :raises Unavailable: the relay can't be reached
+        """
+        wait = min(wait, MAX_WAIT)
+        return self._cloud.ask(FetchResult(job=self.id(), wait=wait), wait + CALL_SECONDS)
+
+    @property
+    def state(self) -> str:
+        """``queued``, ``running``, ``done``, ``failed`` or ``cancelled``."""
+        return self.status().state
+
+    def result(self, timeout: float = CALL_SECONDS) -> Any:
+        """The result.
+
+        :raises CallFailed: there is none; with the code ``timeout`` it goes on
+        :raises Unavailable: the relay can't be reached
+        """
+        end = time.monotonic() + timeout
+        while True:
+            reply = self.status(max(0.0, end - time.monotonic()))
+            if reply.state in DONE:
+                return result_of(reply)
+            if time.monotonic() >= end:
+                raise CallFailed("timeout", f"the job has no result after {timeout:g} s; it goes on")
+
+    def cancel(self) -> None:
+        """End the job, or remove its result."""
+        self._cloud.ask(CancelFunction(job=self.id()), CALL_SECONDS)
+
+
+def result_of(reply: FunctionReply) -> Any:
+    """The result in a reply.
+
+    :raises CallFailed: there is none
+    :raises Unavailable: no worker could be asked; it did not run
+    """
+    if reply.state == "refused" and reply.code == Unavailable.code:
+        raise Unavailable(reply.error)
+    if reply.value is None:
+        raise CallFailed(reply.code or reply.state, reply.error or f"the call has ended as {reply.state}")
+    return decode_value(reply.value)
+
+
+def _encode(arguments: dict[str, Any]) -> bytes:
+    body = encode_value(arguments)
+    if len(body) > FUNCTION_BYTES:
+        words = f"the arguments have {len(body)} bytes; at most {FUNCTION_BYTES} are taken"
+        raise CallFailed("too_large", words)
+    return body
+
+
+def _wait(future: Future[FunctionReply], seconds: float, function: str) -> FunctionReply:
+    try:
+        return future.result(max(0.0, seconds))
+    except FutureTimeout:
+        words = (
+            f"no answer of function {function} in time" if function else "the relay has not answered in time"
+        )
+        raise CallFailed("timeout", f"{words}; it may have run") from None
+
+
+cloud = Cloud()
+"""The workers of the relay of this robot."""

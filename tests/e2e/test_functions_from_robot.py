@@ -1,0 +1,223 @@
+"""A program on a robot calls functions over its own link, and works without the cloud if needed."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from relay_protocol.errors import Unavailable
+from relay_protocol.functions import CallFailed, function
+from robot_client.offload import Cloud, Device, DeviceState, decisions, offload
+from robot_client.offload.device import publish
+from robot_client.offload.function_link import Overtaken
+from robot_client.services.placement import CameraImage, RunOptions, file_of, marker_function
+from tests.robot_client.services.test_markers import LENS, SIZE, drawn
+from tests.worlds import offload_functions
+from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.forked_programs import run_command
+from tests.worlds.processes import BIN, running
+from tests.worlds.relay_process import Relay
+from tests.worlds.waiting import wait_for
+
+
+class RobotProgram:
+    """A relay, and a program on rover that reaches it through a proxy, without a daemon."""
+
+    def __init__(self, folder: Path) -> None:
+        functions = folder / "functions"
+        functions.mkdir()
+        shutil.copy(offload_functions.__file__, functions)
+        options = ("--offload-folder", str(functions), "--offload-processes", "2", "--offload-robots", "*")
+        self.relay = Relay(folder, *options)
+        self.proxy = ChaosProxy(self.relay.robots_port)
+        self.state = folder / "state"
+        code = self.relay.cli("robot", "add", "rover")["enrolment_code"]
+        enroll = [str(BIN / "switchboard-robot"), "enroll", "--relay", f"127.0.0.1:{self.proxy.port}"]
+        enroll += ["--robot", "rover", "--code", "-", "--state", str(self.state)]
+        run_command(enroll, stdin=code).check_returncode()
+        self.cloud = Cloud(self.state)
+        self.device = Device(self.state)
+
+    def publish(self, **critical: bool) -> None:
+        publish(self.state, DeviceState(time.time(), critical))
+
+    def stop(self) -> None:
+        self.cloud.close()
+        self.proxy.close()
+        self.relay.stop()
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotProgram]:
+    made = RobotProgram(tmp_path_factory.mktemp("robot"))
+    with running(made):
+        yield made
+
+
+def test_a_call_returns_its_result_and_large_values(world: RobotProgram) -> None:
+    assert world.cloud.call("add", a=1, b=2)["sum"] == 3
+    cloud = np.arange(1_000_000, dtype=np.float32)
+    assert np.array_equal(world.cloud.call("double", cloud=cloud), cloud * 2)
+
+
+def test_calls_of_many_threads_get_their_own_results(world: RobotProgram) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        sums = pool.map(lambda n: world.cloud.call("add", timeout=60, a=n)["sum"], range(40))
+    assert list(sums) == [n + 1 for n in range(40)]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "code"),
+    [
+        ("loop_for_ever", {}, "timeout"),
+        ("crash", {}, "crashed"),
+        ("missing", {}, "not_found"),
+        ("size_of", {"data": bytes(17_000_000)}, "too_large"),
+    ],
+)
+def test_a_call_without_a_result_is_an_exception(
+    world: RobotProgram, name: str, arguments: dict[str, object], code: str
+) -> None:
+    with pytest.raises(CallFailed) as failed:
+        world.cloud.call(name, timeout=30, **arguments)
+    assert failed.value.code == code
+
+
+def test_a_submitted_job_outlasts_the_link(world: RobotProgram, tmp_path: Path) -> None:
+    go_on = tmp_path / "go on"
+    handle = world.cloud.submit("report", steps=4, go_on=str(go_on))
+    wait_for("it runs", lambda: handle.status().text == "half")
+    world.cloud.close()
+    go_on.touch()
+    again = Cloud(world.state)
+    assert again.handle(handle.id()).result(timeout=60) == 4
+    again.close()
+
+
+def test_a_function_runs_where_the_device_wants_it(world: RobotProgram) -> None:
+    here = []
+
+    @offload("add", client=world.cloud, state=world.device, version=1)
+    def add(a: float, b: float = 1.0) -> float:
+        here.append(a)
+        return a + b
+
+    world.publish(cpu=False)
+    assert (add(1), here) == (2, [1])
+    world.publish(cpu=True)
+    assert (add(2), here) == (3, [1])
+    world.publish(cpu=True, signal=True)
+    assert (add(3), here) == (4, [1, 3])
+    add.where = "cloud"
+    assert (add(4), here) == (5, [1, 3])
+    assert [(each.where, each.why) for each in decisions()[-4:]] == [
+        ("here", "nothing is critical"),
+        ("cloud", "cpu critical"),
+        ("here", "the signal is too weak"),
+        ("cloud", "forced"),
+    ]
+
+
+def test_without_the_relay_a_function_runs_here(world: RobotProgram, tmp_path: Path) -> None:
+    world.publish(cpu=True)
+
+    @offload("crash", client=world.cloud, state=world.device)
+    def crash(began: str = "") -> str:
+        return "here"
+
+    with pytest.raises(CallFailed):
+        crash(str(tmp_path / "began"))
+    assert (tmp_path / "began").read_bytes() == b"x"
+
+    @offload("crash", client=world.cloud, state=world.device)
+    @function(name="crash", repeatable=True)
+    def crash_or_here(began: str = "") -> str:
+        return "here"
+
+    assert crash_or_here() == "here"
+    world.cloud.close()
+    elsewhere = Cloud(world.state.parent / "nowhere")
+    unreached = offload("add", client=elsewhere, state=world.device)(lambda a: a + 1)
+    assert unreached(1) == 2
+    with pytest.raises(Unavailable):
+        elsewhere.call("add", a=1)
+
+
+def test_the_service_markers_searches_on_a_worker_and_here_once_the_link_is_cut(world: RobotProgram) -> None:
+    find = marker_function("4X4_50", SIZE, RunOptions("auto", world.cloud, world.device))
+    picture = CameraImage(drawn(7, (0.2, 0.1, 1.5), 0.4))
+    world.publish(cpu=False)
+    here = find(picture, LENS)
+    assert [each.number for each in here] == [7]
+    world.publish(cpu=True)
+
+    def ran_away() -> bool:
+        found = find(picture, LENS)
+        assert found == here
+        return find.ran_away
+
+    # The first call may take longer than a service waits, while the worker imports OpenCV.
+    world.cloud.call("detect_markers", timeout=60, image=file_of(picture))
+    wait_for("it runs on a worker", ran_away)
+    world.proxy.black_hole()
+    assert not ran_away()
+    world.proxy.heal()
+    world.cloud.close()
+
+
+@pytest.mark.parametrize("broken", ["link", "relay"])
+def test_a_call_whose_link_or_relay_is_lost_is_an_error_at_once(
+    world: RobotProgram, tmp_path: Path, broken: str
+) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        call = pool.submit(
+            world.cloud.call, "sleep", timeout=60, duration=30.0, began=str(tmp_path / "began")
+        )
+        wait_for("it runs", (tmp_path / "began").exists)
+        if broken == "link":
+            world.proxy.reset()
+        else:
+            world.relay.kill()
+        with pytest.raises(CallFailed) as failed:
+            call.result(30)
+    assert failed.value.code == "lost"
+    if broken == "relay":
+        with pytest.raises(Unavailable):
+            world.cloud.call("add", a=1)
+        world.relay.start()
+
+    def answered() -> bool:
+        try:
+            return bool(world.cloud.call("add", timeout=30, a=1)["sum"] == 2)
+        except Unavailable:
+            return False
+
+    wait_for("it is reached again", answered)
+    assert (tmp_path / "began").read_bytes() == b"x"
+
+
+def test_a_newer_frame_takes_the_place_of_one_that_waits(world: RobotProgram, tmp_path: Path) -> None:
+    go_on = tmp_path / "go on"
+    world.cloud.call("add", a=1)
+    connection = world.cloud._connection
+    assert connection is not None
+
+    def call(steps: int) -> int:
+        return int(world.cloud.call("report", timeout=60, newest=True, steps=steps, go_on=str(go_on)))
+
+    with ThreadPoolExecutor(3) as pool:
+        first = pool.submit(call, 1)
+        wait_for("the first is sent", lambda: any(each.sent for each in connection._replies.values()))
+        second = pool.submit(call, 2)
+        wait_for("the second waits", lambda: connection._waiting)
+        third = pool.submit(call, 3)
+        with pytest.raises(Overtaken):
+            second.result(60)
+        go_on.touch()
+        assert (first.result(60), third.result(60)) == (1, 3)

@@ -1,0 +1,108 @@
+"""Homes of robots, and links that end because the robot has a newer one at another relay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock
+
+from relay_db.queries import HomeRelayRecord
+from relay_server.cluster.bus import LocalBus
+from relay_server.cluster.homes import READ_SECONDS, ClusterHomes
+from relay_server.cluster.relays import RelayInfo
+from relay_server.robots.registry import RobotRegistry
+
+
+class FakeDatabase:
+    """The homes of robots that all relays share."""
+
+    def __init__(self) -> None:
+        self.homes: dict[int, HomeRelayRecord] = {}
+
+    async def read(self, query: Any) -> list[HomeRelayRecord]:
+        assert query.__name__ == "home_relays"
+        return list(self.homes.values())
+
+    async def write(self, query: Any, robot: int, relay: str, *epoch: int) -> int | None:
+        known = self.homes.get(robot, HomeRelayRecord(robot, "", 0))
+        if query.__name__ == "claim_home_relay":
+            self.homes[robot] = HomeRelayRecord(robot, relay, known.epoch + 1)
+            return known.epoch + 1
+        if (known.relay, known.epoch) == (relay, *epoch):
+            self.homes[robot] = HomeRelayRecord(robot, "", known.epoch)
+        return None
+
+
+class FakeLink:
+    """A robot's control link at one relay.
+
+    :ivar answers: called if the robot still answers after the link was closed
+    """
+
+    answers: Callable[[], None] | None = None
+
+    def close_replaced(self, reason: str, answers: Callable[[], None]) -> None:
+        assert reason == "the robot has connected to another relay"
+        self.answers = answers
+
+
+class Relays:
+    """All relays live."""
+
+    def find(self, relay: str) -> RelayInfo:
+        return RelayInfo(relay, f"{relay}.example.org", 9092, "1.0", 1.0)
+
+
+class Member:
+    """One relay of a cluster, with one robot."""
+
+    def __init__(self, name: str, clock: Clock, database: Any, bus: LocalBus) -> None:
+        relays: Any = Relays()
+        robots = RobotRegistry(lambda: 1000.0)
+        self.robot = robots.robot(1, "rover", "main")
+        self.homes = ClusterHomes(clock, database, robots, bus, relays, name)
+        self.reported: list[tuple[str, str, str]] = []
+        """Robots whose key is used twice, with the newer and the older address."""
+        self.homes.on_key_used_twice = lambda robot, newer, older: self.reported.append(
+            (robot.name, newer, older)
+        )
+        Deferred.fromCoroutine(self.homes.start())
+
+    def connect(self, address: str) -> Any:
+        """The robot connects here."""
+        link: Any = FakeLink()
+        Deferred.fromCoroutine(self.homes.connecting(self.robot, address))
+        self.robot.control_link, self.robot.address = link, address
+        return link
+
+
+@pytest.mark.parametrize(
+    ("bus_works", "newer"), [(True, "192.0.2.2"), (False, "unknown address at relay two.example.org")]
+)
+def test_a_link_that_answers_after_the_robot_connected_to_another_relay_is_reported(
+    bus_works: bool, newer: str
+) -> None:
+    """A link that ends without an answer is not. Without the bus, the database shows the new home later."""
+    clock, database = Clock(), FakeDatabase()
+    bus = LocalBus(clock)
+    first = Member("one", clock, database, bus)
+    second = Member("two", clock, database, bus if bus_works else LocalBus(clock))
+    older = first.connect("192.0.2.1")
+    clock.advance(0)
+    link = second.connect("192.0.2.2")
+    clock.advance(0 if bus_works else READ_SECONDS)
+    assert older.answers is not None
+    assert first.reported == []
+    older.answers()
+    assert first.reported == [("rover", newer, "192.0.2.1")]
+    assert (link.answers, second.reported) == (None, [])
+    elsewhere = first.homes.elsewhere(1)
+    assert elsewhere is not None
+    assert elsewhere.id == "two"
+    assert [first.homes.other(each) for each in ("two", "one", "")] == [elsewhere, None, None]
+    assert second.homes.elsewhere(1) is None
+    for each in (first, second):
+        each.homes.stop()

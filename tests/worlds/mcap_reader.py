@@ -1,0 +1,51 @@
+"""Files read by MCAP's own library, and messages to write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from relay_server.recordings.mcap_file import McapChannel
+
+CHATTER = McapChannel("/chatter", "std_msgs/msg/String", "cdr", "string data\n")
+WORDS = McapChannel("/words", "std_msgs/msg/String", "json")
+
+
+class Read(NamedTuple):
+    """One message."""
+
+    topic: str
+    type: str
+    encoding: str
+    schema: bytes
+    log_time: int
+    publish_time: int
+    body: bytes
+
+
+def read(path: Path) -> list[Read]:
+    """All messages of a complete file, with verified checksums and summary."""
+    with path.open("rb") as stream:
+        list(StreamReader(stream, validate_crcs=True).records)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        found = []
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            times = (message.log_time, message.publish_time)
+            assert channel.message_encoding == {"ros2msg": "cdr", "jsonschema": "json"}[schema.encoding]
+            found.append(Read(channel.topic, schema.name, schema.encoding, schema.data, *times, message.data))
+        assert summary.statistics.message_count == len(found)
+        return found
+
+
+def profile(path: Path) -> str:
+    """The profile in the file's header."""
+    with path.open("rb") as stream:
+        return str(make_reader(stream).get_header().profile)

@@ -1,0 +1,62 @@
+import { describe, expect, it } from 'vitest'
+import { addressOf, bindingOf, boundTo, type Document, mappingOf, partsOf, withoutStatement, withStatement } from './roleDocument'
+
+const TYPE = 'http://www.w3.org/1999/02/22-rdf-syntax-ns#type'
+const ref = (name: string) => ({ '@id': `fierro:${name}` })
+const GAMEPAD: Document = [
+  { '@id': 'fierro:R', [TYPE]: [ref('role')], 'fierro:subject': [ref('Pad')], 'fierro:action': [ref('Drive')], 'fierro:directObject': [ref('Motors')] },
+  { '@id': 'fierro:Pad', 'fierro:action': [ref('Drive')], 'fierro:data': [ref('AXES')] },
+  { '@id': 'fierro:AXES', 'fierro:field': [ref('AXIS_0')] },
+  {
+    '@id': 'fierro:AXIS_0',
+    [TYPE]: [ref('field')],
+    'fierro:mapping': [ref('Port_5'), ref('Elsewhere')],
+    'switchboard:resource': [{ '@value': 'robots/pad/topics/joy#/axes/0' }],
+  },
+  { '@id': 'fierro:Drive', 'fierro:directObject': [ref('Motors')], 'fierro:process': [ref('GamePadX')] },
+  { '@id': 'fierro:GamePadX', 'fierro:port': [ref('Port_5')] },
+]
+
+describe('a document of a Role', () => {
+  it('has items in the lanes of its parts, with types by properties', () => {
+    const { parts, items } = partsOf(GAMEPAD)
+    expect(parts).toEqual({ subject: 'Pad', action: 'Drive', directObject: 'Motors' })
+    expect(items.map(({ name, type, lane }) => [name, type, lane])).toEqual([
+      ['AXES', 'data', 'subject'],
+      ['AXIS_0', 'field', 'subject'],
+      ['GamePadX', 'process', 'action'],
+      ['Port_5', 'port', 'action'],
+      ['Elsewhere', 'element', null],
+    ])
+    expect(items[1]).toMatchObject({ resources: ['robots/pad/topics/joy#/axes/0'], mappings: ['fierro:Port_5', 'fierro:Elsewhere'] })
+  })
+
+  it('gets and loses statements', () => {
+    const more = withStatement(GAMEPAD, mappingOf('fierro:AXIS_1', 'fierro:Port_5'))
+    expect(partsOf(more).items.find(({ name }) => name === 'AXIS_1')?.mappings).toEqual(['fierro:Port_5'])
+    expect(withoutStatement(more, mappingOf('fierro:AXIS_1', 'fierro:Port_5'))).toEqual(GAMEPAD)
+    expect(withStatement(GAMEPAD, mappingOf('fierro:AXIS_0', 'fierro:Port_5'))).toBe(GAMEPAD)
+    const unbound = withoutStatement(GAMEPAD, bindingOf('fierro:AXIS_0', 'robots/pad/topics/joy#/axes/0'))
+    expect(partsOf(unbound).items.find(({ name }) => name === 'AXIS_0')?.resources).toEqual([])
+  })
+})
+
+it.each([
+  ['robots/pad/topics/joy#/axes/0', { robot: 'pad', kind: 'topics', name: '/joy', path: 'axes[0]' }],
+  ['robots/a%20b/topics/ns/cmd_vel#/linear/x', { robot: 'a b', kind: 'topics', name: '/ns/cmd_vel', path: 'linear.x' }],
+  ['robots/rover/services/beep', { robot: 'rover', kind: 'services', name: '/beep', path: '' }],
+  ['pipes/drive', { robot: '', kind: 'pipes', name: 'drive', path: '' }],
+  ['programs/lamp/ports/power', { robot: '', kind: 'programs', name: 'lamp/ports/power', path: '' }],
+])('reads %s', (text, parts) => {
+  expect(boundTo(text)).toEqual({ text, ...parts })
+})
+
+it.each(['', 'rovers/x', 'robots/%E0%A4%A/topics/x'])('%s is no address', (text) => {
+  expect(boundTo(text)).toBeNull()
+})
+
+it('writes addresses that it can read', () => {
+  for (const [robot, topic, path] of [['a b', '/joy', 'axes[0]'], ['rover', '/ns/cmd_vel', 'linear.x'], ['rover', '/scan', '']] as const) {
+    expect(boundTo(addressOf(robot, topic, path))).toMatchObject({ robot, name: topic, path })
+  }
+})

@@ -1,0 +1,54 @@
+/** Keeps what a page shows up to date, by a stream of the relay or by asking again and again. */
+
+const FIRST_PAUSE_MS = 1000
+const LONGEST_PAUSE_MS = 15_000
+
+/** Runs `stream` again and again until the returned function is called.
+ *
+ * @param stream ends when its signal does
+ * @param failed gets the reason when a stream could not be opened or broke off
+ */
+export function keepFollowing(stream: (signal: AbortSignal) => Promise<void>, failed: (reason: string) => void): () => void {
+  const ending = new AbortController()
+  let timer: ReturnType<typeof setTimeout> | undefined
+  let pause = FIRST_PAUSE_MS
+
+  async function run() {
+    const began = performance.now()
+    try {
+      await stream(ending.signal)
+    } catch (error) {
+      if (ending.signal.aborted) return
+      failed(error instanceof Error ? error.message : String(error))
+    }
+    if (ending.signal.aborted) return
+    pause = performance.now() - began > LONGEST_PAUSE_MS ? FIRST_PAUSE_MS : Math.min(LONGEST_PAUSE_MS, pause * 2)
+    timer = setTimeout(() => void run(), pause)
+  }
+
+  void run()
+  return () => {
+    ending.abort()
+    clearTimeout(timer)
+  }
+}
+
+/** Runs `work` now, and again `pauseMs` after each run has ended, until the returned function is called.
+ *
+ * @param work never throws
+ */
+export function repeat(work: () => Promise<void>, pauseMs: number): () => void {
+  let ended = false
+  let timer: ReturnType<typeof setTimeout> | undefined
+
+  async function run() {
+    await work()
+    if (!ended) timer = setTimeout(() => void run(), pauseMs)
+  }
+
+  void run()
+  return () => {
+    ended = true
+    clearTimeout(timer)
+  }
+}
