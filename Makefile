@@ -22,7 +22,7 @@ demo: ## run a relay with two simulated robots and print how to log in (options:
 	@exec $(BIN)/switchboard demo $(DEMO)
 
 test: setup ## all tests: Python, ROS 2, browser, portal (options: PYTEST='-k drive')
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
+	$(BIN)/python scripts/run_tests.py -n 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
 	$(NPM) run test
 
 CASES := $(BIN)/python -m pytest -q --no-header -r N --tb=short --table

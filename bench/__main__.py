@@ -93,7 +93,7 @@ def measure(name: str, options: Options) -> tuple[list[Row], str]:
     rows: list[Row] = []
     missing = ""
     try:
-        rows = importlib.import_module(f"bench.{name}").run(options)
+        rows = _measured(name, options)
     except Unavailable as error:
         missing = str(error)
     except Exception as error:
@@ -101,6 +101,18 @@ def measure(name: str, options: Options) -> tuple[list[Row], str]:
         missing = f"failed: {error!r}"
     print(f"    {name} took {time.monotonic() - began:.0f} s", flush=True)
     return rows, missing
+
+
+def _measured(name: str, options: Options) -> list[Row]:
+    """The rows of one measurement, checked."""
+    rows: list[Row] = importlib.import_module(f"bench.{name}").run(options)
+    for row in rows:
+        row.check(name)
+    names = [row.what for row in rows]
+    twice = {what for what in names if names.count(what) > 1}
+    if twice:
+        raise ValueError(f"rows of {name} have the same name: {', '.join(sorted(twice))}")
+    return rows
 
 
 def exit_code(rows: list[Row], missing: dict[str, str], *, strict: bool) -> int:

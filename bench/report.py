@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import platform
 import time
@@ -61,6 +62,13 @@ class Row:
     ratio_bar: float | None = None
     bar: float | None = None
     note: str = ""
+
+    def check(self, measurement: str) -> None:
+        """Raise ValueError unless this is a row of the measurement, with finite figures."""
+        if self.measurement != measurement:
+            raise ValueError(f"the row '{self.what}' is of {self.measurement}, not of {measurement}")
+        if not all(math.isfinite(figure) for figure in (self.ours, self.other or 0.0)):
+            raise ValueError(f"the row '{self.what}' has a figure that is not finite")
 
     @property
     def ratio(self) -> float | None:
