@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
-from collections import defaultdict
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.durations import Durations, ProcessorSeconds, file_of
 from tests.worlds import processes
 
 processes.forking = True
@@ -26,9 +26,7 @@ settings.register_profile("same", _UNTIMED, derandomize=True, database=None)
 settings.load_profile("same")
 
 SECONDS = Path(__file__).with_name("seconds.txt")
-"""Seconds and path of each file that takes at least :data:`NOTED` seconds, the longest first."""
-
-NOTED = 5.0
+"""Seconds, processor seconds and path of each slow file, the slowest first."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -37,35 +35,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     gc.disable()
-    if config.getoption("--note-seconds", False) and not hasattr(config, "workerinput"):
-        config.pluginmanager.register(_Durations())
+    processor = ProcessorSeconds(config)
+    config.pluginmanager.register(processor)
+    if not hasattr(config, "workerinput"):
+        noted = SECONDS if config.getoption("--note-seconds", False) else None
+        config.pluginmanager.register(Durations(processor, noted))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    noted = {path: float(seconds) for seconds, path in map(str.split, SECONDS.read_text().splitlines())}
-    items.sort(key=lambda item: -noted.get(_file(item.nodeid), 0.0))
+    lines = [line.split() for line in SECONDS.read_text().splitlines()]
+    noted = {path: float(seconds) for seconds, _, path in lines}
+    items.sort(key=lambda item: -noted.get(file_of(item.nodeid), 0.0))
 
 
 def pytest_collection_finish() -> None:
     """Collected tests stay until the end: repeated garbage collection of them would cost seconds."""
     gc.freeze()
     gc.enable()
-
-
-def _file(nodeid: str) -> str:
-    return nodeid.partition("::")[0]
-
-
-class _Durations:
-    """Sums up the duration of each file, over all workers."""
-
-    def __init__(self) -> None:
-        self._of: defaultdict[str, float] = defaultdict(float)
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self._of[_file(report.nodeid)] += report.duration
-
-    def pytest_sessionfinish(self) -> None:
-        longest = sorted(self._of.items(), key=lambda item: -item[1])
-        lines = [f"{seconds:.0f} {path}\n" for path, seconds in longest if seconds >= NOTED]
-        SECONDS.write_text("".join(lines))
