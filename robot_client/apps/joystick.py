@@ -31,38 +31,39 @@ class Gamepad(Protocol):
     """An input device for driving."""
 
     @property
-    def name(self) -> str:
-        """For display; empty when no device is connected."""
+    def problem(self) -> str:
+        """Why the connected device cannot be used; empty otherwise."""
 
     def read(self) -> GamepadState | None:
         """Its state; ``None`` when no device is connected, and once when the device has changed."""
 
 
 class ButtonLayout(NamedTuple):
-    """Where a pad has what, by the numbers of pygame: as gamepads of the Xbox kind have it.
+    """Where a pad has what, by the numbers of pygame.
 
     :ivar ahead: axis; -1 is away from oneself
     :ivar left: axis; -1 is to the left
-    :ivar hold: the dead man's button (right shoulder)
-    :ivar stop: button (B)
-    :ivar back: button that releases control (BACK)
+    :ivar hold: the dead man's button
+    :ivar stop: button
+    :ivar back: button that releases control
     """
 
-    ahead: int = 1
-    left: int = 0
-    hold: int = 5
-    stop: int = 1
-    back: int = 6
+    ahead: int
+    left: int
+    hold: int
+    stop: int
+    back: int
 
 
 class Gamepads:
-    """The first gamepad there is; one that is unplugged is gone, and the next one counts.
+    """The first gamepad whose layout is known; one that is unplugged is gone, and the next one counts.
 
-    :param layout: of gamepads that SDL does not know; what it knows has the same buttons in the same places
+    :param layout: of gamepads that SDL does not know; without it they do not drive, since any of their buttons could
+        be pressed by accident. What SDL knows has the same buttons in the same places.
     :raises click.ClickException: there is no pygame
     """
 
-    def __init__(self, layout: ButtonLayout) -> None:
+    def __init__(self, layout: ButtonLayout | None) -> None:
         # Without a window there is no focus to have; signals are ours.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ["SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS"] = "1"
@@ -78,14 +79,22 @@ class Gamepads:
         self._layout = layout
         self._open: Any = None
         self._known = False
+        self._unknown: Any = None
         pygame.display.init()  # events come by it
         pygame.joystick.init()
         controller.init()
 
     @property
-    def name(self) -> str:
-        """The device's own name."""
-        return "" if self._open is None else str(self._open.name)
+    def problem(self) -> str:
+        """Names the device, and the buttons that are pressed, so that their numbers can be found."""
+        pad = self._unknown
+        if pad is None or not pad.get_init():
+            return ""
+        pressed = " ".join(str(button) for button in range(pad.get_numbuttons()) if pad.get_button(button))
+        return (
+            f"the layout of {pad.get_name()} is not known; "
+            f"give --axes and --buttons (pressed: {pressed or 'no button'})"
+        )
 
     def read(self) -> GamepadState | None:
         """Its state now."""
@@ -100,7 +109,7 @@ class Gamepads:
             self._open = None
             # Also when another gamepad is connected: the button was held on this one.
             return None
-        if self._open is None and self._pygame.joystick.get_count():
+        if self._open is None:
             self._open_first()
         if self._open is None:
             return None
@@ -112,8 +121,15 @@ class Gamepads:
         return self._open.get_init() and self._open.get_instance_id() not in removed
 
     def _open_first(self) -> None:
-        self._known = bool(self._controller.is_controller(0))
-        self._open = self._controller.Controller(0) if self._known else self._pygame.joystick.Joystick(0)
+        devices = range(self._pygame.joystick.get_count())
+        known = next((device for device in devices if self._controller.is_controller(device)), None)
+        self._known = known is not None
+        if known is not None:
+            self._open = self._controller.Controller(known)
+        elif devices and self._layout is not None:
+            self._open = self._pygame.joystick.Joystick(0)
+        unknown = self._open is None and len(devices) > 0
+        self._unknown = self._pygame.joystick.Joystick(0) if unknown else None
 
     def _read_controller(self) -> GamepadState:
         pygame, pad = self._pygame, self._open
@@ -127,6 +143,7 @@ class Gamepads:
 
     def _read_joystick(self) -> GamepadState:
         layout = self._layout
+        assert layout is not None
         return GamepadState(
             -self._axis(layout.ahead),
             -self._axis(layout.left),
@@ -366,7 +383,9 @@ class Joystick:
     def _state(self, stick: Stick | None) -> tuple[str, str]:
         driver, phase = self._driver, self._deadman.phase
         words = phase.value
-        if phase is DeadmanPhase.READY and not driver.in_control:
+        if phase is DeadmanPhase.NO_GAMEPAD and self._pad.problem:
+            words = self._pad.problem
+        elif phase is DeadmanPhase.READY and not driver.in_control:
             words = "press the button to take control"
         elif phase is DeadmanPhase.MUST_RELEASE and driver.in_control:
             words = f"you have control: {phase.value}"
@@ -389,10 +408,12 @@ class Joystick:
         return words, moving.strip()
 
 
-def _layout(axes: tuple[int, int], buttons: tuple[int, int, int]) -> ButtonLayout:
-    ahead, left = axes
-    hold, stop, back = buttons
-    return ButtonLayout(ahead=ahead, left=left, hold=hold, stop=stop, back=back)
+def _layout(axes: tuple[int, int] | None, buttons: tuple[int, int, int] | None) -> ButtonLayout | None:
+    if axes is None and buttons is None:
+        return None
+    if axes is None or buttons is None:
+        raise click.UsageError("--axes and --buttons describe a gamepad together: give both")
+    return ButtonLayout(*axes, *buttons)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -414,18 +435,14 @@ def _layout(axes: tuple[int, int], buttons: tuple[int, int, int]) -> ButtonLayou
 @click.option(
     "--axes",
     type=(int, int),
-    default=(ButtonLayout().ahead, ButtonLayout().left),
-    show_default=True,
     metavar="AHEAD LEFT",
-    help="Of a pad that SDL does not know.",
+    help="Axes of a pad that SDL does not know; such a pad drives only with --axes and --buttons.",
 )
 @click.option(
     "--buttons",
     type=(int, int, int),
-    default=(ButtonLayout().hold, ButtonLayout().stop, ButtonLayout().back),
-    show_default=True,
     metavar="HOLD STOP BACK",
-    help="Of a pad that SDL does not know.",
+    help="Buttons of a pad that SDL does not know. The program shows the numbers of pressed buttons.",
 )
 def main(
     url: str,
@@ -434,8 +451,8 @@ def main(
     turn: float,
     dead: float,
     expo: float,
-    axes: tuple[int, int],
-    buttons: tuple[int, int, int],
+    axes: tuple[int, int] | None,
+    buttons: tuple[int, int, int] | None,
 ) -> None:
     """Drive the robot at URL (ws://relay/robots/NAME) by a gamepad.
 

@@ -638,6 +638,33 @@ class TestGamepad:
         page.evaluate("pad.buttons[5].pressed = false")
         ends_with_one_zero(page, relay)
 
+    def test_a_pad_with_another_layout_drives_by_a_chosen_button_only(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """Until then no button drives; the choice is stored."""
+        page = self.open(open_page)
+        page.evaluate("pad.mapping = ''; pad.axes[1] = -1")
+        expect(seen(page, "gamepad")).to_have_attribute("data-pad", "unknown")
+        page.evaluate("for (const button of [4, 5, 6, 7, 9]) pad.buttons[button].pressed = true")
+        page.wait_for_timeout(300)  # shows absence
+        assert relay.commands() == []
+        page.evaluate("for (const button of pad.buttons) button.pressed = false")
+        page.evaluate("pad.axes[1] = 0")
+
+        seen(page, "gamepad-choose").click()
+        expect(seen(page, "gamepad")).to_have_attribute("data-pad", "choosing")
+        page.evaluate("pad.buttons[9].pressed = true")
+        expect(seen(page, "gamepad")).to_have_attribute("data-pad", "ready")
+        page.reload()
+        ready_to_drive(page)
+        page.evaluate("pad.mapping = ''")
+        expect(seen(page, "gamepad")).to_have_attribute("data-pad", "ready")
+        page.wait_for_timeout(100)  # the page sees that it was released
+        page.evaluate("pad.axes[1] = -1; pad.buttons[9].pressed = true")
+        driving(relay, 3)
+        page.evaluate("pad.buttons[9].pressed = false")
+        ends_with_one_zero(page, relay)
+
 
 class TestTilt:
     def test_a_tilted_phone_drives(self, open_page: OpenPage, relay: FakeRelay) -> None:

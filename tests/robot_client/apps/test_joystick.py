@@ -20,7 +20,7 @@ AHEAD = GamepadState(1.0, 0.0, True)
 class Pad:
     """A gamepad in memory."""
 
-    name = "pad"
+    problem = ""
 
     def __init__(self) -> None:
         self.now: GamepadState | None = LOOSE
