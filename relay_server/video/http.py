@@ -72,10 +72,17 @@ _OWN_PAGES = (None, b"same-origin", b"none")
 _VIEWER = """<!DOCTYPE html>
 <html lang="en">
 <head><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title></head>
-<body><img src="stream?{query}" alt="{title}"></body>
+<body>{content}</body>
 </html>
 """
 """The page around a stream, as web_video_server has it."""
+
+_BY_WEBSOCKET = """<img alt="{title}"><p></p><script src="/stream_viewer.js"></script>
+<noscript><img src="stream?{query}" alt="{title}"></noscript>"""
+"""It holds none of the browser's six HTTP/1.1 connections."""
+
+_BY_HTTP = """<img src="stream?{query}" alt="{title}">"""
+"""For PNG, which is not sent by websocket."""
 
 
 class TicketChecker(Protocol):
@@ -263,9 +270,13 @@ class VideoResource(Resource):
     async def _stream_viewer(self, request: Request, robot: str) -> bytes:
         """The page contains nothing of the robot, so it needs no credentials. The stream in it does."""
         query = _query(request)
-        camera = parse_parameters(query, "stream").camera
+        wanted = parse_parameters(query, "stream")
+        title = html.escape(f"{wanted.camera} of {robot}")
+        content = _BY_HTTP if wanted.settings.codec == "png" else _BY_WEBSOCKET
         request.setHeader(b"content-type", b"text/html; charset=utf-8")
-        return _VIEWER.format(title=html.escape(f"{camera} of {robot}"), query=html.escape(query)).encode()
+        return _VIEWER.format(
+            title=title, content=content.format(title=title, query=html.escape(query))
+        ).encode()
 
     @described(
         ApiOperation(

@@ -259,6 +259,74 @@ def test_two_cameras_side_by_side(world: World, open_page: OpenPage) -> None:
     assert left["x"] + left["width"] <= right["x"]
 
 
+FULL = """
+  for (let number = 0; number < 6; number++) {
+    const image = document.createElement('img')
+    image.src = `/robots/rover/video/stream?topic=CAMERA&number=${number}`
+    document.body.append(image)
+  }
+""".replace("CAMERA", CAMERA)
+"""Six image streams hold all connections of HTTP/1.1 that the browser allows to the relay."""
+
+IS_FULL = """
+  () => fetch('/api/v1/session', { signal: AbortSignal.timeout(1000) }).then(() => false, () => true)
+"""
+
+
+def test_a_stop_passes_when_image_streams_hold_all_connections(world: World, open_page: OpenPage) -> None:
+    """In the cockpit, on the card of a robot, and for all robots."""
+    page = open_page()
+    page.evaluate(FULL)
+    wait_for("no request gets a connection", lambda: page.evaluate(IS_FULL))
+    stop = page.get_by_test_id("stop")
+
+    def stopped_by(click: Callable[[], None], words: Locator, text: str) -> None:
+        click()
+        expect(words).to_contain_text(text)
+        # Another path of the same press may still arrive.
+        wait_for("it is resumed", lambda: world.relay.run_cli("resume", "rover").returncode == 0)
+
+    stopped_by(stop.click, page.get_by_test_id("drive-words"), "The robot is stopped.")
+    page.get_by_role("link", name="all robots").click()
+    card = page.get_by_test_id("robot-card")
+    stopped_by(card.get_by_test_id("stop").click, page.get_by_text("rover is stopped."), "rover")
+    expect(card.get_by_test_id("robot-stopped")).to_have_count(0)
+    page.get_by_role("button", name="Stop all robots").click()
+    expect(card.get_by_test_id("robot-stopped")).to_have_text("Stopped")
+    assert page.evaluate(IS_FULL)
+    world.relay.cli("resume", "rover")
+
+
+HIDE = """hidden => {
+  Object.defineProperty(document, 'hidden', { value: hidden, configurable: true })
+  document.dispatchEvent(new Event('visibilitychange'))
+}"""
+
+
+def test_the_page_of_a_stream_holds_no_http_connection_and_pauses_while_it_is_hidden(
+    world: World, open_page: OpenPage
+) -> None:
+    """Seven such pages leave room for requests."""
+    page = open_page()
+    page.goto("about:blank")
+    wait_for("nobody watches", lambda: not any(each["viewers"] for each in world.streams()))
+    pages = [page, *(page.context.new_page() for _ in range(6))]
+    for each in pages:
+        each.goto(f"/robots/rover/video/stream_viewer?topic={CAMERA}&width=320")
+        expect(each.locator("img")).to_have_js_property("naturalWidth", 320)
+    world.until_streamed(CAMERA, viewers=7, width=320)
+    assert not page.evaluate(IS_FULL)
+    for each in pages:
+        each.evaluate(HIDE, True)
+    wait_for("nobody watches", lambda: not any(each["viewers"] for each in world.streams()))
+    page.evaluate(HIDE, False)
+    world.until_streamed(CAMERA, viewers=1, width=320)
+    before = page.evaluate("document.querySelector('img').src")
+    wait_for("frames come", lambda: page.evaluate("document.querySelector('img').src") != before)
+    for each in pages[1:]:
+        each.close()
+
+
 def test_h264_is_shown(world: World, open_page: OpenPage) -> None:
     """The decoded frames show the robot's view, and continue."""
     page = open_page()

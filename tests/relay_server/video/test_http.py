@@ -247,6 +247,15 @@ async def test_the_page_around_a_stream_asks_for_it_with_the_same_words(show: Sh
     assert (status, headers.get_content_type()) == (200, "text/html")
     assert "default-src 'self'" in headers["content-security-policy"]
     assert f'<img src="stream?topic={CAMERA}&amp;width=320&amp;x=%22%3E%3Cscript'.encode() in body
+    assert body.count(b"<script") == body.count(b'<script src="/stream_viewer.js">') == 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_page_around_png_has_an_image_and_no_script(show: Show) -> None:
+    """PNG is not sent by websocket."""
+    path = STREAM.replace("/stream", "/stream_viewer") + "&type=png"
+    _, _, body = await show.request(path, Authorization="").answer()
+    assert f'<body><img src="stream?topic={CAMERA}&amp;type=png"'.encode() in body
     assert b"<script" not in body
 
 

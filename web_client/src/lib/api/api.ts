@@ -83,11 +83,12 @@ export async function actions(robot: string, type: string): Promise<Provided[]> 
 /** Stops a robot. Returns whether the stop is pending, because the robot is offline.
  *
  * @param stopId the id of the press, the same on all paths
+ * @param signal ends the attempt: the robot is stopped already
  * @throws Refusal, also when a part of the stop failed
  * @throws Unreachable also when no answer comes for longer than the relay ever takes
  */
-export async function stopRobot(name: string, why = '', stopId = newStopId()): Promise<boolean> {
-  const patience = new ReceiveTimeout(STOP_TIMEOUT_MS)
+export async function stopRobot(name: string, why = '', stopId = newStopId(), signal?: AbortSignal): Promise<boolean> {
+  const patience = new ReceiveTimeout(STOP_TIMEOUT_MS, signal)
   try {
     // The request is sent even if the page is left at once.
     const options = { names: { robot: name }, body: { why, stop_id: stopId }, keepalive: true, signal: patience.signal }

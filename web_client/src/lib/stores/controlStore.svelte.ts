@@ -1,7 +1,7 @@
 /** Control of one robot by this page: holder, driving, stop and resume. */
-import * as api from '../api/api'
 import { app } from './appStore.svelte.ts'
 import * as control from '../control/control'
+import { stopByAllPaths, UNANSWERED_MS } from '../control/stop'
 import { Drive, type Limits, type Source, type StopReason, stopWords } from '../control/drive'
 import type { Link } from '../ros/robotLink'
 import { sentence } from '../format'
@@ -21,6 +21,7 @@ type Order = 'take_control' | 'release_control' | 'grant_control' | 'refuse_cont
 /** State of a stop of this page. Its message takes precedence over all others. */
 const STOP_STATES = {
   going: 'Stopping…',
+  unanswered: 'The stop is not confirmed yet. If the robot moves, stop it on site.',
   done: 'The robot is stopped.',
   later: 'The robot is offline. It is stopped as soon as it is online.',
   unsure: 'The stop is not confirmed. Press STOP again, or stop the robot on site.',
@@ -50,6 +51,8 @@ export class ControlStore {
   words = $state<string | null>(null)
   /** State of the last stop of this page; null when it is settled. */
   stopState = $state<keyof typeof STOP_STATES | null>(null)
+  /** Whether a stop was sent and is not answered yet. */
+  readonly isStopping = $derived(this.stopState === 'going' || this.stopState === 'unanswered')
   readonly stopWords = $derived(this.stopState === null ? null : STOP_STATES[this.stopState])
   /** Changes when every input must be released. */
   releaseCount = $state(0)
@@ -98,7 +101,7 @@ export class ControlStore {
     this.words = null
     const reason = this.drive.grab(source, performance.now())
     if (reason !== null) this.words = this.blocked ?? stopWords(reason)
-    else if (this.stopState !== 'going') this.stopState = null
+    else if (!this.isStopping) this.stopState = null
     return reason === null
   }
 
@@ -188,7 +191,7 @@ export class ControlStore {
   private mayMove(before: Control | null): void {
     const resumed = before !== null && before.stopped !== null
     const meanwhile = before === null && this.stopState !== 'unsure'
-    if ((resumed || meanwhile) && this.stopState !== 'going') this.stopState = null
+    if ((resumed || meanwhile) && !this.isStopping) this.stopState = null
   }
 
   /** The robot has confirmed that it is stopped. */
@@ -259,22 +262,26 @@ export class ControlStore {
 
   // Stop
 
-  /** Stops the robot for all users, by websocket and HTTP at the same time, as one stop. */
+  /** Stops the robot for all users, by all paths at the same time, as one stop. */
   async stop(): Promise<void> {
     this.drive.stop('stop_button')
     this.releaseCount += 1
     this.stopState = 'going'
     const press = ++this.presses
+    const timer = setTimeout(() => {
+      if (press === this.presses && this.stopState === 'going') this.stopState = 'unanswered'
+    }, UNANSWERED_MS)
     try {
       const id = control.newStopId()
       const asked = this.call<ControlReply & { done: boolean; stopped: Stopped | null }>('/relay/stop', STOP, { why: '', stop_id: id }, SWITCH_S)
-      const ways = [asked.then(({ done }) => !done), api.stopRobot(this.bridge.name, '', id)]
-      const later = await control.firstSuccess(ways, inWords)
+      const later = await stopByAllPaths(this.bridge.name, id, [asked.then(({ done }) => !done)], inWords)
       app.settle([this.bridge.name])
       this.stopState = later ? 'later' : 'done'
     } catch (error) {
       // After repeated presses the last one counts.
-      if (press === this.presses && this.stopState === 'going') this.notConfirmed(error)
+      if (press === this.presses && this.isStopping) this.notConfirmed(error)
+    } finally {
+      clearTimeout(timer)
     }
   }
 
