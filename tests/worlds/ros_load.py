@@ -23,19 +23,21 @@ from tests.worlds.waiting import PATIENCE, readable, wait_for
 
 PUBLISHER = Path(__file__).parents[1] / "e2e" / "clients" / "load.py"
 STRING = "std_msgs/msg/String"
+WINDOW = 100
 
 
 class Publisher:
     """The node of ``tests/e2e/clients/load.py`` in a robot's domain.
 
     :param least: number of messages on ``/load/small``; it continues until :meth:`is_enough`
-    :param rate: of them, at most; it does not outrun the client that notes what it has taken
+    :param rate: of them, at most
+    :param window: how many it may be ahead of the client that notes what it has taken
     :ivar folder: of its files ``taken`` and ``enough``
     """
 
-    def __init__(self, robot: Robot, least: int, rate: float) -> None:
+    def __init__(self, robot: Robot, least: int, rate: float, window: int = WINDOW) -> None:
         self.folder = Path(tempfile.mkdtemp(dir=robot.folder))
-        self._command = [sys.executable, str(PUBLISHER), str(least), str(rate), str(self.folder)]
+        self._command = [sys.executable, str(PUBLISHER), str(least), str(rate), str(window), str(self.folder)]
         self._robot = robot
         self.process: Process | None = None
 

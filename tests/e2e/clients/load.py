@@ -1,8 +1,8 @@
 """A ROS 2 node that publishes numbered messages on several topics, once they have subscribers.
 
-Arguments: least messages on /load/small, most of them per second, and a folder. Its file ``taken`` has the
-number of the last one that a client has received; the node is at most WINDOW ahead. It continues until there is
-a file ``enough``. Prints SUBSCRIBED when all topics have a subscriber, then DONE with the numbers of published
+Arguments: least messages on /load/small, most of them per second, a window, and a folder. Its file ``taken`` has
+the number of the last one that a client has received; the node is at most the window ahead. It continues until
+there is a file ``enough``. Prints SUBSCRIBED when all topics have a subscriber, then DONE with the numbers of published
 messages, as JSON. It runs on for late subscribers until it is ended.
 """
 
@@ -16,10 +16,9 @@ import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-LEAST, RATE, FOLDER = int(sys.argv[1]), float(sys.argv[2]), Path(sys.argv[3])
+LEAST, RATE, WINDOW, FOLDER = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
 SMALL_BYTES, BIG_BYTES, BURST = 200, 20_000, 100
 SMALL_PER_BIG, SMALL_PER_UNSURE = 100, 20
-WINDOW = 100
 PATIENCE = 1.0
 """Seconds without progress of the client after which one more message is published: it may have missed the first."""
 
@@ -65,7 +64,8 @@ while sent["small"] < LEAST or not (FOLDER / "enough").exists():
     due = min(int((time.monotonic() - begun) * RATE), last + WINDOW)
     if time.monotonic() - moved > PATIENCE:
         due, moved = sent["small"] + 1, time.monotonic()
-    while sent["small"] < due:
+    # At most 20 ms worth of messages at once, so a delayed process catches up slowly.
+    for _ in range(min(due - sent["small"], max(1, int(RATE / 50)))):
         publish("small", SMALL_BYTES)
         if sent["small"] % SMALL_PER_BIG == 0:
             publish("big", BIG_BYTES)
