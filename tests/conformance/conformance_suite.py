@@ -36,7 +36,7 @@ SPEC_ONLY = "a rule of this project's SPEC, not of rosbridge v2"
 """What a case that cites the SPEC alone, or first, says about a server that never promised it: nothing."""
 
 FIXTURE_VERSION = 2
-FIXTURE_PATIENCE = 10.0
+FIXTURE_PATIENCE = 20.0
 """Seconds a command of the fixture node waits, unless it is told to wait for less."""
 
 _names = itertools.count(1)

@@ -18,13 +18,13 @@ from typing import Any, NamedTuple
 
 from relay_protocol import identity
 
-PATIENCE = 10.0
+PATIENCE = 30.0
 ABSENCE = 0.4
 HEARTBEAT = 1.0
-RARE = 20.0
+RARE = 90.0
 """A heartbeat so rare that a robot which hangs up within :data:`PATIENCE` did not do so for silence."""
 
-PATIENCE_TO_DIAL = 30.0
+PATIENCE_TO_DIAL = 60.0
 PATIENCE_AFTER_ANOTHER_NAME = 90.0
 """Seconds until a robot is back: after a loss, and after a relay of another name (SPEC 2.2)."""
 

@@ -7,10 +7,11 @@ import contextlib
 import json
 import struct
 import time
+from collections.abc import Callable
 from typing import Any
 
 from conformance_suite import not_offered
-from link_relay import ABSENCE, Link, LinkRelay, Sample
+from link_relay import ABSENCE, PATIENCE, Link, LinkRelay, Sample
 
 TWIST = "geometry_msgs/msg/Twist"
 TRIGGER = "std_srvs/srv/Trigger"
@@ -18,6 +19,8 @@ FIBONACCI = "example_interfaces/action/Fibonacci"
 CDR = b"\0\1\0\0"
 OVERTAKEN = 0.1
 """Seconds by which zero may come before a command that was sent earlier."""
+LATE = 0.75
+"""Seconds over its promise that a robot is forgiven on a computer that runs other things beside it."""
 DRIVER = 11
 """The source that drives, unless a case says another."""
 
@@ -84,9 +87,18 @@ class Wheels:
     """Drives the robot by one channel link, and reads reports of its motion by another.
 
     :param resume: whether a stopped robot is resumed first
+    :param held_up: seconds so far for which the computer may have held up the robot
     """
 
-    def __init__(self, relay: LinkRelay, driving: Link, watching: Link, resume: bool = True) -> None:
+    def __init__(
+        self,
+        relay: LinkRelay,
+        driving: Link,
+        watching: Link,
+        resume: bool = True,
+        held_up: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        self._held_up = held_up
         topic = wheels(relay)
         policy = relay.facts().get("motion", {})
         self.deadline = policy.get("deadline_ms", 500) / 1000
@@ -166,7 +178,7 @@ class Wheels:
 
     def start(self, source: int = DRIVER) -> Sample:
         """Commands until it moves; returns the first report. A zero before releases the controls."""
-        until = time.monotonic() + 10
+        until = time.monotonic() + PATIENCE
         self.command(0.0, source=source)
         while True:
             assert time.monotonic() < until, "commands, sent again and again, did not move the robot"
@@ -184,7 +196,7 @@ class Wheels:
         stood: Sample | None = None
         while True:
             try:
-                report = self.watching.expect_sample(1, 3 if stood is None else OVERTAKEN)
+                report = self.watching.expect_sample(1, PATIENCE if stood is None else OVERTAKEN)
             except AssertionError:
                 if stood is None:
                     raise
@@ -195,6 +207,12 @@ class Wheels:
                 stood = report
             elif report.stamp - stood.stamp > OVERTAKEN * 1e9:
                 return (stood.stamp - moving.stamp) / 1e9
+
+    def stands_in_time(self, moving: Sample) -> None:
+        """Waits until it stands, which it promises to do within ``stop_within_ms``."""
+        before = self._held_up()
+        took = self.stands(moving)
+        assert took <= self.stop_within + LATE + self._held_up() - before, f"it took {took * 1000:.0f} ms"
 
     def never_moves(self, seconds: float = ABSENCE) -> None:
         """Only standstill is reported within this time."""

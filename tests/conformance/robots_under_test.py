@@ -7,7 +7,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from link_relay import ENROLMENT_CODE
+from link_relay import ENROLMENT_CODE, PATIENCE_TO_DIAL
 
 from tests.worlds.processes import BIN, Process, ros_environment
 from tests.worlds.ros_domains import free_domain
@@ -36,7 +36,7 @@ class Daemon:
 
     def run(self) -> None:
         """Starts it, once it is enrolled."""
-        self._daemon.popen.wait(30)
+        self._daemon.popen.wait(PATIENCE_TO_DIAL)
         self._node.wait_to_say("READY")
         run = [str(BIN / "switchboard-robot"), "run", "--state", str(self._state)]
         self._daemon = Process(run, self._folder, "daemon", self._environment)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,7 +22,6 @@ from relay_server.auth.account_limit import FAILURES_OF_ACCOUNT
 from relay_server.cli.admin_socket_client import send_order
 from relay_server.cli.app import os_user
 from relay_server.icpi.messages import IcpiMessage, parse, write
-from tests.worlds.machine_pauses import Pulse
 from tests.worlds.nats_servers import NatsServer, nats_server
 from tests.worlds.postgresql_server import postgresql_database
 from tests.worlds.processes import running
@@ -211,15 +209,11 @@ def test_a_foxglove_url_revoked_at_one_relay_is_cut_at_another(
 
     with opened(fleet.relays[serving]) as client:
         assert json.loads(client.recv(PATIENCE))["op"] == "serverInfo"
-        with Pulse() as pulse:
-            revoked = time.monotonic()
-            answer = fleet.request("DELETE", fleet.relays[revoking], f"/foxglove-urls/{made.json()['id']}")
-            assert answer.status_code == 204, answer.text
-            with pytest.raises(ConnectionClosed, match="revoked"):
-                while True:
-                    client.recv(PATIENCE)
-            took = time.monotonic() - revoked
-            assert took < 1 + pulse.lost(), f"it took {took:.2f} s"
+        answer = fleet.request("DELETE", fleet.relays[revoking], f"/foxglove-urls/{made.json()['id']}")
+        assert answer.status_code == 204, answer.text
+        with pytest.raises(ConnectionClosed, match="revoked"):
+            while True:
+                client.recv(PATIENCE)
     for relay in fleet.relays:
         with pytest.raises(InvalidStatus) as refused:
             opened(relay)

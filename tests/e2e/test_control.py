@@ -176,7 +176,7 @@ def test_a_viewer_stops_the_driver_and_may_not_resume(scene: ControlWorld) -> No
         assert vic.call("/relay/stop", {"why": "somebody is in the way"})["values"]["success"]
         scene.stands()
         took_ms = (scene.robot.events("standstill", since)[0]["t"] - since) / 1e6
-        assert took_ms < LATE_MS + 1000 * pulse.lost()
+        assert took_ms < LATE_MS + 1000 * pulse.held_up()
         refused = vic.call("/relay/resume")
         assert refused["result"] is False
         assert "only the holder of control" in refused["values"]

@@ -21,7 +21,6 @@ from websockets.typing import Subprotocol
 from relay_server.common import close_codes
 from tests.worlds.accessibility import violations
 from tests.worlds.browser import checked_pages, open_session, portal, seen
-from tests.worlds.machine_pauses import Pulse
 from tests.worlds.relay_process import Relay
 from tests.worlds.small_robot import SmallRobot
 from tests.worlds.waiting import PATIENCE, wait_for
@@ -113,11 +112,8 @@ def test_a_url_that_is_revoked_while_connected_is_cut_with_the_reason(scene: Sce
                 ).items()
             ),
         )
-        with Pulse() as pulse:
-            revoked = time.monotonic()
-            assert scene.http.delete(f"{URLS}/{made['id']}").status_code == 204
-            closed = cut(client)
-            assert time.monotonic() - revoked < 1 + pulse.lost()
+        assert scene.http.delete(f"{URLS}/{made['id']}").status_code == 204
+        closed = cut(client)
         assert closed.rcvd is not None
         assert closed.rcvd.code == close_codes.UNAUTHENTICATED
         assert "revoked" in closed.rcvd.reason
@@ -131,12 +127,8 @@ def test_a_url_revoked_on_the_command_line_is_cut_too(scene: Scene) -> None:
     made = scene.relay.cli("foxglove-url", "create", "rover", "ann", "--relay", str(scene.http.base_url))
     with opened(made["url"]) as client:
         until(client, "serverInfo")
-        with Pulse() as pulse:
-            scene.relay.cli("foxglove-url", "revoke", str(made["id"]))
-            # The start of the process does not count as the relay's time.
-            revoked = time.monotonic()
-            cut(client)
-            assert time.monotonic() - revoked < 1 + pulse.lost()
+        scene.relay.cli("foxglove-url", "revoke", str(made["id"]))
+        cut(client)
 
 
 def published(scene: Scene, url: str, text: str) -> list[dict[str, Any]]:

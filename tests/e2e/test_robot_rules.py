@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.robot_client.ros import Peer
-from tests.worlds.machine_pauses import Pulse
+from tests.worlds.machine_pauses import NOTICED, Pulse
 from tests.worlds.processes import ros_environment
 from tests.worlds.relay_process import Relay
 from tests.worlds.robot_process import Robot
@@ -110,7 +110,7 @@ def test_goals_arrive_whenever_they_are_given(scene: ControlWorld) -> None:
                 for each in given:
                     time.sleep(PAUSE_SECONDS)
                     ann.send(op="publish", topic="/go", msg={"data": each})
-                wait_for("all have come", lambda: come() or pulse.lost())
+                wait_for("all have come", lambda: come() or pulse.held_up() > NOTICED)
             return come()
 
         wait_for("all of a round have come", all_arrive)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import time
 from typing import Any
 
 import pytest
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import MalformedMessage
+from tests.worlds.growth import grows_linearly
 
 KEYS = st.text('xX1:"\\ e{}ß', max_size=2)
 
@@ -119,20 +119,13 @@ def test_numbers_are_not_judged_here(number: str) -> None:
     ['{"a":{"x":1,"y":2}}', '"text"', '{"":1}', "0.125", '"\\u0061"', '{"\\u0061":[]}', "[[],[]]", "key"],
 )
 def test_the_time_grows_with_the_text_and_no_faster(unit: str) -> None:
-    """CPU time for four times the text, with a wide margin."""
 
-    def seconds(count: int) -> float:
+    def make(count: int) -> bytes:
         units = [f'"{number}":0' for number in range(count)] if unit == "key" else [unit] * count
         text = ",".join(units)
-        data = (f"{{{text}}}" if unit == "key" else f"[{text}]").encode()
-        times = []
-        for _ in range(5):
-            begun = time.process_time()
-            jsontext.check_keys(data)
-            times.append(time.process_time() - begun)
-        return min(times)
+        return (f"{{{text}}}" if unit == "key" else f"[{text}]").encode()
 
-    assert seconds(80_000) < 12 * seconds(20_000) + 0.01
+    assert grows_linearly(jsontext.check_keys, make, 80_000)
 
 
 @given(TEXTS, st.sampled_from([0, 400]))

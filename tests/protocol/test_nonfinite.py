@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from typing import Any
 
 import msgspec
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 from relay_protocol import nonfinite, rosbridge
 from relay_protocol.errors import Invalid, MalformedMessage, SwitchboardError
 from relay_protocol.nonfinite import NotFinite
+from tests.worlds.growth import grows_linearly
 from tests.worlds.ros_texts import LINE, registry
 
 TYPES = registry(
@@ -88,17 +88,14 @@ def test_junk_raises_only_protocol_errors(pieces: list[str]) -> None:
 
 @pytest.mark.parametrize("piece", ['"",', '"\\"NaN",', "NaN,", '"\\\\', "-Infinity ", '"NaN', " " * 9, '\\"'])
 def test_time_is_linear(piece: str) -> None:
-    """Ten times the input takes about ten times as long, not a hundred times."""
 
-    def seconds(pieces: int) -> float:
-        text = f'{{"op":"publish","topic":"/a","msg":[NaN,{piece * pieces}'.encode()
-        began = time.process_time()
+    def read(text: bytes) -> None:
         with pytest.raises(MalformedMessage):
             rosbridge.decode(text)
-        return time.process_time() - began
 
-    short = min(seconds(10_000) for _ in range(3))
-    assert min(seconds(100_000) for _ in range(3)) < 50 * short + 0.05
+    assert grows_linearly(
+        read, lambda count: f'{{"op":"publish","topic":"/a","msg":[NaN,{piece * count}'.encode(), 100_000
+    )
 
 
 @pytest.mark.parametrize(

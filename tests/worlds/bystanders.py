@@ -57,14 +57,14 @@ def undisturbed(relay: Relay, watchers: list[Watcher]) -> Iterator[None]:
         for each in watchers:
             seen = len(each.stamps)
             wait_for("odometry still comes", lambda each=each, seen=seen: len(each.stamps) > seen + 3)
-        lost = pulse.lost()
+        held_up = pulse.held_up()
     for each, start in zip(watchers, begun, strict=True):
         assert each.broken == ""
         stamps = each.stamps[start - 1 :]
         gaps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
         assert min(gaps) > 0
         # A stalled machine sends nothing meanwhile.
-        assert max(gaps) < STAMP_GAP + lost
+        assert max(gaps) < STAMP_GAP + held_up
     assert relay.process.popen is process
     assert process.poll() is None
     assert "Traceback" not in relay.log[logged:]

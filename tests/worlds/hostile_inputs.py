@@ -12,7 +12,6 @@ import random
 import re
 import socket
 import struct
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -599,26 +598,6 @@ def _is_whole(answer: bytes) -> bool:
     return head.startswith(b"HTTP/1.1 101") or chunked or (length is not None and len(body) >= int(length[1]))
 
 
-REFERENCE_SECONDS = 0.004
-"""Processor time of :func:`_reference_work` on the machine on which the limits of processor time were chosen."""
-
-
-def _reference_work() -> None:
-    value = {"user": "a" * 50, "numbers": list(range(100))}
-    for _ in range(300):
-        value = json.loads(json.dumps(value))
-
-
-def slowness() -> float:
-    """The factor of this machine's present slowness, at least 1. CPU time limits are multiplied by it."""
-    found = []
-    for _ in range(5):
-        before = time.thread_time()
-        _reference_work()
-        found.append(time.thread_time() - before)
-    return max(1.0, min(found) / REFERENCE_SECONDS)
-
-
 class Reactor:
     """CPU time of the thread in which a relay serves all clients.
 
@@ -632,11 +611,8 @@ class Reactor:
         """CPU seconds so far, by the scheduler's own count."""
         return int(self._count.read_text().split()[0]) / 1e9
 
-    def cost(self, work: Callable[[], object], times: int = 1) -> float:
-        """CPU seconds of some work; the minimum of several runs, since other work may interfere."""
-        found = []
-        for _ in range(times):
-            before = self.seconds()
-            work()
-            found.append(self.seconds() - before)
-        return min(found)
+    def cost(self, work: Callable[[], object]) -> float:
+        """CPU seconds of some work."""
+        before = self.seconds()
+        work()
+        return self.seconds() - before

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from tests.worlds.processes import Process
+from tests.worlds.waiting import PATIENCE
 
 
 class PipedProcess(Process):
@@ -40,7 +41,7 @@ class PipedProcess(Process):
         """Writes a line to its standard input."""
         os.write(self.feed, line.encode() + b"\n")
 
-    def stop(self, seconds: float = 30.0) -> int:
+    def stop(self, seconds: float = PATIENCE) -> int:
         """SIGTERM, reap, and return the exit code."""
         code = super().stop(seconds)
         with contextlib.suppress(OSError):

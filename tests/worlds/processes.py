@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.worlds.forked_programs import Forked, forkable, start
-from tests.worlds.waiting import freeze, wait_for
+from tests.worlds.waiting import PATIENCE, freeze, wait_for
 
 BIN = Path(sys.executable).parent
 START_SECONDS = 60.0
@@ -92,9 +92,9 @@ class Process:
     def kill(self) -> None:
         """kill -9, and reap."""
         self.popen.kill()
-        self.popen.wait(10)
+        self.popen.wait(PATIENCE)
 
-    def stop(self, seconds: float = 30.0) -> int:
+    def stop(self, seconds: float = PATIENCE) -> int:
         """SIGTERM (also to a frozen one), reap, and return the exit code."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGTERM)
@@ -103,7 +103,7 @@ class Process:
                 self.popen.wait(seconds)
             except subprocess.TimeoutExpired:
                 self.popen.kill()
-                self.popen.wait(10)
+                self.popen.wait(PATIENCE)
         return int(self.popen.returncode)
 
 

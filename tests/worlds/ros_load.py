@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import socket
 import sys
-import time
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,31 @@ from tests.worlds.waiting import PATIENCE, readable, wait_for
 
 PUBLISHER = Path(__file__).parents[1] / "e2e" / "clients" / "load.py"
 STRING = "std_msgs/msg/String"
+WINDOW = 100
 
 
 class Publisher:
-    """The node of ``tests/e2e/clients/load.py`` in a robot's domain."""
+    """The node of ``tests/e2e/clients/load.py`` in a robot's domain.
 
-    def __init__(self, robot: Robot, seconds: float, rate: float) -> None:
-        command = [sys.executable, str(PUBLISHER), str(seconds), str(rate)]
-        self.process = Process(command, robot.folder, "load", ros_environment(robot.domain))
+    :param least: number of messages on ``/load/small``; it continues until :meth:`is_enough`
+    :param rate: of them, at most
+    :param window: how many it may be ahead of the client that notes what it has taken
+    :ivar folder: of its files ``taken`` and ``enough``
+    """
+
+    def __init__(self, robot: Robot, least: int, rate: float, window: int = WINDOW) -> None:
+        self.folder = Path(tempfile.mkdtemp(dir=robot.folder))
+        self._command = [sys.executable, str(PUBLISHER), str(least), str(rate), str(window), str(self.folder)]
+        self._robot = robot
+        self.process: Process | None = None
+
+    def start(self) -> None:
+        environment = ros_environment(self._robot.domain)
+        self.process = Process(self._command, self._robot.folder, "load", environment)
+
+    def is_enough(self) -> None:
+        """Ends the load."""
+        (self.folder / "enough").touch()
 
     def known_to(self, client: Client) -> None:
         """Waits until a client sees its topics."""
@@ -41,26 +59,31 @@ class Publisher:
         wait_for("the load's topics are known", known, 60)
 
     def sent(self) -> dict[str, Any]:
-        """Waits for its end; returns the number of sent messages by topic, with its ``seconds`` and ``cpu``
-        seconds.
-        """
-        wait_for("the publisher has a subscriber", lambda: "SUBSCRIBED" in self.process.said(), 60)
-        wait_for("the publisher is done", lambda: "DONE" in self.process.said(), 3600)
-        line = self.process.wait_to_say("DONE")
+        """Waits for its end; returns the number of sent messages by topic."""
+        process = self.process
+        assert process is not None
+        wait_for("the publisher has a subscriber", lambda: "SUBSCRIBED" in process.said())
+        wait_for("the publisher is done", lambda: "DONE" in process.said(), 3600)
+        line = process.wait_to_say("DONE")
         return dict(json.loads(line.removeprefix("DONE")))
 
     def stop(self) -> None:
-        self.process.stop()
+        if self.process is not None:
+            self.process.stop()
 
 
 class Counter(Listener):
     """A client that reads all messages of some topics and stores the numbers.
 
     :param topics: short name (``small`` for ``/load/small``) and ``throttle_rate`` in milliseconds
+    :param publisher: waits for this client
     """
 
-    def __init__(self, client: Client, topics: dict[str, int]) -> None:
+    def __init__(self, client: Client, topics: dict[str, int], publisher: Publisher | None = None) -> None:
         super().__init__(client)
+        self._taken = (
+            None if publisher is None else os.open(publisher.folder / "taken", os.O_CREAT | os.O_WRONLY)
+        )
         self.numbers: dict[str, list[int]] = {name: [] for name in topics}
         client.send(op="set_level", level="error")
         for name, throttle in topics.items():
@@ -71,7 +94,10 @@ class Counter(Listener):
         """Stores its number."""
         if message["op"] == "publish":
             name = message["topic"].removeprefix("/load/")
-            self.numbers[name].append(int(message["msg"]["data"].split()[0]))
+            number = int(message["msg"]["data"].split()[0])
+            self.numbers[name].append(number)
+            if name == "small" and self._taken is not None:
+                os.pwrite(self._taken, b"%09d" % number, 0)
         else:
             self.broken = message["msg"]
 
@@ -105,18 +131,16 @@ class Stalled:
         for name in topics:
             ask = json.dumps({"op": "subscribe", "topic": f"/load/{name}", "type": STRING})
             self._socket.sendall(Frame(Opcode.TEXT, ask.encode()).serialize(mask=True))
-        self._begun = time.monotonic()
 
-    def cut_after(self, relay: Relay, user: str) -> float:
-        """Seconds until the relay has disconnected it."""
+    def is_cut(self, relay: Relay, user: str) -> None:
+        """Waits until the relay has disconnected it."""
 
         def gone() -> bool:
             return user not in [
                 client["user"] for robot in relay.cli("status")["robots"] for client in robot["clients"]
             ]
 
-        wait_for("the stalled client is cut", gone, 60)
-        return time.monotonic() - self._begun
+        wait_for("the stalled client is cut", gone)
 
     def ended(self) -> bool:
         """Whether it finds a close frame that says why it was cut when it reads again."""

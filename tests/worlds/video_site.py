@@ -307,17 +307,13 @@ class RawClient:
         """The next part of a stream: its headers, and its body by its length."""
         return await deferToThread(self._part)
 
-    async def parts(self, seconds: float) -> list[float]:
-        """Reads the head, and parts for this time; returns the age of each at its arrival in seconds."""
-        return await deferToThread(self._parts, seconds)
-
     async def slowly(self, rate: float, seconds: float) -> bytes:
         """Reads this many bytes per second for this time."""
         return await deferToThread(self._slowly, rate, seconds)
 
-    async def closed(self, seconds: float = 10.0) -> float:
-        """Reads to the end; returns the duration in seconds."""
-        return await deferToThread(self._closed, seconds)
+    async def closed(self) -> bool:
+        """Reads to the end; returns whether it is a regular one, not a reset."""
+        return await deferToThread(self._closed)
 
     def leave(self) -> None:
         self.socket.close()
@@ -334,15 +330,6 @@ class RawClient:
         headers = email.parser.BytesParser().parsebytes(self._until(b"\r\n\r\n"))
         return headers, self._take(int(headers["content-length"]))
 
-    def _parts(self, seconds: float) -> list[float]:
-        self._head()
-        end = time.monotonic() + seconds
-        ages = []
-        while time.monotonic() < end:
-            headers, _ = self._part()
-            ages.append(time.monotonic() - float(headers["x-timestamp"]))
-        return ages
-
     def _slowly(self, rate: float, seconds: float) -> bytes:
         began = time.monotonic()
         data, self._data = self._data, b""
@@ -353,15 +340,13 @@ class RawClient:
                 time.sleep(0.01)  # a slow reader
         return data
 
-    def _closed(self, seconds: float) -> float:
-        began = time.monotonic()
-        self.socket.settimeout(seconds)
+    def _closed(self) -> bool:
         try:
             while self.socket.recv(65536):
                 pass
         except ConnectionResetError:
-            pass
-        return time.monotonic() - began
+            return False
+        return True
 
     def _until(self, mark: bytes) -> bytes:
         while mark not in self._data:

@@ -53,10 +53,10 @@ def freeze(pid: int) -> None:
     The kernel delivers the signal to one of its threads; until that one has a CPU, the others continue.
     """
     os.kill(pid, signal.SIGSTOP)
-    wait_for(f"process {pid} stands still", lambda: all(state == "T" for state in _states(pid)))
+    wait_for(f"process {pid} stands still", lambda: all(state == "T" for state in thread_states(pid)))
 
 
-def _states(pid: int) -> list[str]:
+def thread_states(pid: int) -> list[str]:
     """The state of each thread of a process, by its letter in ``stat`` (proc(5)): after the name, which may
     contain anything.
     """

@@ -238,7 +238,7 @@ def test_websocket_fragments(client: Client) -> None:
 @case("any op", "RFC 6455, 5.5.2 Ping")
 def test_ping(client: Client) -> None:
     """A websocket ping is answered."""
-    assert client.connection.ping(b"are you there").wait(8)
+    assert client.connection.ping(b"are you there").wait(client.patience)
 
 
 # --- credentials ---

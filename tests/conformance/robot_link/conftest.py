@@ -6,9 +6,14 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from link_relay import ENROLMENT_CODE, Link, LinkRelay
+from link_relay import ENROLMENT_CODE, PATIENCE, PATIENCE_TO_DIAL, Link, LinkRelay
 from robot_tasks import Wheels
 from robots_under_test import ROBOTS
+
+from tests.worlds.machine_pauses import Pulse
+
+GRAPH_SECONDS = 5.0
+"""For the graph of a robot that may have nothing to drive."""
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -30,8 +35,8 @@ def channel(relay: LinkRelay) -> Iterator[Link]:
 @pytest.fixture
 def drive(relay: LinkRelay) -> Iterator[Wheels]:
     """A robot that can be driven."""
-    with relay.channel() as watching, relay.channel() as driving:
-        yield Wheels(relay, driving, watching)
+    with relay.channel() as watching, relay.channel() as driving, Pulse() as pulse:
+        yield Wheels(relay, driving, watching, held_up=pulse.held_up)
 
 
 @pytest.fixture(scope="session")
@@ -44,10 +49,10 @@ def relay(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     made = LinkRelay("robot-under-test")
     robot = ROBOTS[request.param](tmp_path_factory.mktemp(request.param), made.robot, made.port)
     try:
-        made.enrol(30)
+        made.enrol(PATIENCE_TO_DIAL)
         robot.run()
         if robot.graph_grows:
-            _wait_for_graph(made)
+            _wait_for_graph(made, PATIENCE)
         yield made
     finally:
         robot.stop()
@@ -68,16 +73,16 @@ def _dialled(config: pytest.Config, listen: str) -> Iterator[LinkRelay]:
     try:
         made.enrol(patience)
         made.register(patience)
-        _wait_for_graph(made)
+        _wait_for_graph(made, GRAPH_SECONDS)
         yield made
     finally:
         made.close()
 
 
-def _wait_for_graph(made: LinkRelay) -> None:
-    """A daemon may know little of its graph at first; waits some seconds."""
+def _wait_for_graph(made: LinkRelay, seconds: float) -> None:
+    """A daemon may know little of its graph at first."""
     assert made.control
     made.facts()
-    until = time.monotonic() + 5
+    until = time.monotonic() + seconds
     while time.monotonic() < until and not any(name.endswith("/heard") for name in made.graph["topics"]):
         time.sleep(0.02)

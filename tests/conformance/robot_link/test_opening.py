@@ -8,7 +8,7 @@ import json
 import time
 
 from conformance_suite import case, not_offered
-from link_relay import Link, LinkRelay, message
+from link_relay import PATIENCE, Link, LinkRelay, message
 from robot_tasks import subscribe
 
 STRANGE = {"later": True, "fields": [1, {"more": None}]}
@@ -58,9 +58,9 @@ def test_ping_on_channel(channel: Link) -> None:
 @case("ping", "SPEC 2.3, each end pings")
 def test_robot_pings(relay: LinkRelay, channel: Link) -> None:
     """The robot pings on both links."""
-    until = time.monotonic() + 4
+    until = time.monotonic() + PATIENCE
     while not (relay.control.pings and channel.pings):
-        assert time.monotonic() < until, f"{relay.control.pings} and {channel.pings} pings in 4 s"
+        assert time.monotonic() < until, f"{relay.control.pings} and {channel.pings} pings in {PATIENCE:g} s"
         time.sleep(0.01)
 
 

@@ -8,7 +8,7 @@ import struct
 import time
 
 from conformance_suite import case, not_offered
-from link_relay import Link, LinkRelay
+from link_relay import PATIENCE, Link, LinkRelay
 from robot_tasks import CDR, FIBONACCI, TRIGGER, TWIST, fibonacci, service, stands
 
 
@@ -18,7 +18,7 @@ def test_call(relay: LinkRelay, channel: Link) -> None:
     name = service(relay)
     cdr = "cdr" in relay.hello["encodings"]
     args = {"cdr": base64.b64encode(CDR + b"\0").decode()} if cdr else {"args": {}}
-    channel.say("call_service", id="one", service=name, type=TRIGGER, timeout=5, **args)
+    channel.say("call_service", id="one", service=name, type=TRIGGER, timeout=PATIENCE, **args)
     answer = channel.expect("service_response", id="one")
     assert answer["result"] is True
     if cdr:
@@ -46,7 +46,7 @@ def test_offer_service(relay: LinkRelay) -> None:
         if not stands(offering, "advertise_service", "advertised_service"):
             not_offered("services of clients in its graph")
         request = {"cdr": base64.b64encode(CDR + b"\0").decode()}
-        calling.say("call_service", id="mine", service=name, type=TRIGGER, timeout=8, **request)
+        calling.say("call_service", id="mine", service=name, type=TRIGGER, timeout=PATIENCE, **request)
         asked = offering.expect("call_service", service=name)
         assert asked["type"] == TRIGGER
         answer = base64.b64encode(CDR + b"\1\0\0\0" + struct.pack("<I", 5) + b"here\0").decode()
@@ -85,7 +85,7 @@ def test_get_type_unknown(channel: Link) -> None:
 def test_get_interfaces(channel: Link) -> None:
     """get_interfaces is answered by full names, or by failed."""
     channel.say("get_interfaces")
-    until = time.monotonic() + 8
+    until = time.monotonic() + PATIENCE
     while time.monotonic() < until:
         with contextlib.suppress(AssertionError):
             channel.expect("failed", 0.1, request="get_interfaces")

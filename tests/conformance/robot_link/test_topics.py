@@ -8,7 +8,7 @@ import struct
 import time
 
 from conformance_suite import case, not_offered
-from link_relay import ABSENCE, Link, LinkRelay
+from link_relay import ABSENCE, PATIENCE, Link, LinkRelay
 from robot_tasks import CDR, sensor, subscribe
 
 
@@ -158,7 +158,7 @@ def test_publish(relay: LinkRelay, channel: Link) -> None:
     reported = channel.expect("advertised", number=2)
     assert not reported.get("motion")
     body = b'{"data": "echo"}' if reported["encoding"] == "json" else CDR + struct.pack("<I", 5) + b"echo\0"
-    until = time.monotonic() + 8
+    until = time.monotonic() + PATIENCE
     heard = b""
     while b"echo" not in heard:
         assert time.monotonic() < until, "no echo came"

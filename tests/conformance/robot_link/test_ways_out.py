@@ -8,7 +8,7 @@ import time
 
 import pytest
 from conformance_suite import case
-from link_relay import HEARTBEAT, JSON, RARE, RELAY_JSON_FRAME, Link, LinkRelay, frame, message
+from link_relay import HEARTBEAT, JSON, PATIENCE, RARE, RELAY_JSON_FRAME, Link, LinkRelay, frame, message
 from robot_tasks import subscribe
 
 
@@ -63,7 +63,7 @@ def test_refused(relay: LinkRelay) -> None:
     assert not relay.control.ended
 
 
-def breaks(link: Link, data: bytes, seconds: float = 8.0) -> None:
+def breaks(link: Link, data: bytes, seconds: float = PATIENCE) -> None:
     """After these bytes the robot sends an error or nothing, and disconnects earlier than after silence."""
     link.raw(data)
     link.wait_end(seconds)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 
 from conformance_suite import case, not_offered
-from link_relay import LinkRelay
+from link_relay import PATIENCE, LinkRelay
 from robot_tasks import CDR, DRIVER, Wheels
 
-LATE = 0.75
-"""Seconds over its promise that a robot is forgiven on a computer that runs other things beside it."""
+TRIES = 20
+"""Of which one is not held up by a computer that runs other things beside the robot."""
 
 
 @case("motion", "SPEC 2.5 advertised, motion")
@@ -32,8 +32,7 @@ def test_stops_when_commands_cease(drive: Wheels) -> None:
     moving = drive.start()
     for _ in range(3):
         drive.command(0.2)
-    took = drive.stands(moving)
-    assert took <= drive.stop_within + LATE, f"it took {took * 1000:.0f} ms"
+    drive.stands_in_time(moving)
 
 
 @case("motion", "SPEC 2.5-27")
@@ -97,14 +96,14 @@ def test_nonsense_for_a_command(drive: Wheels) -> None:
 @case("motion", "SPEC 2.5 unadvertise")
 def test_unadvertise_stops(drive: Wheels) -> None:
     """unadvertise stops what this publisher left moving, without waiting for the watchdog."""
-    took = []
-    for _ in range(4):
+    took: list[float] = []
+    while not took or min(took) >= 0.6 * drive.stop_within:
+        assert len(took) < TRIES, f"it took {[f'{each * 1000:.0f}' for each in took]} ms"
         moving = drive.start()
         drive.driving.say("unadvertise", number=2)
         took.append(drive.stands(moving))
         drive.never_moves()
         drive.advertise()
-    assert min(took) < 0.6 * drive.stop_within, f"it took {[f'{each * 1000:.0f}' for each in took]} ms"
 
 
 @case("motion", "SPEC 2.5-28")
@@ -112,15 +111,14 @@ def test_cut_channel_stops(drive: Wheels) -> None:
     """When the channel link that drives is cut the robot stands still within stop_within_ms."""
     moving = drive.start()
     drive.driving.cut()
-    took = drive.stands(moving)
-    assert took <= drive.stop_within + LATE, f"it took {took * 1000:.0f} ms"
+    drive.stands_in_time(moving)
 
 
 @case("motion", "SPEC 2.5-28")
 def test_other_samples_are_no_commands(drive: Wheels) -> None:
     """Samples of another number and pings are no commands: they don't keep it moving."""
     drive.start()
-    until = time.monotonic() + 3
+    until = time.monotonic() + PATIENCE
     while drive.next_speed(0.05) != 0:
         assert time.monotonic() < until, "it goes on"
         drive.driving.sample(3, b"{}")

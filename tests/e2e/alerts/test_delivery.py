@@ -72,9 +72,10 @@ def test_a_robot_that_is_back_ends_the_alert_once(world: AlertWorld) -> None:
     robot = Robot(world.relay, "rover")
     with running(robot):
         world.relay.cli("right", "grant", "viewer", "rover", "viewer")
+        before = time.time()
         robot.daemon.kill()
         delivery = only_delivery(world)
-        assert abs(int(delivery.headers["switchboard-timestamp"]) - time.time()) < 60
+        assert before - 1 <= int(delivery.headers["switchboard-timestamp"]) <= time.time()
         (alert,) = delivery.json["alerts"]
         assert (alert["robot"], alert["kind"], alert["event"]) == ("rover", "offline", "begun")
         seen = world.alerts(world.viewer, "?robot=rover&open=true")

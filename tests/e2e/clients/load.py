@@ -1,20 +1,26 @@
-"""A ROS 2 node that publishes numbered messages on several topics at a high rate, once they have subscribers.
+"""A ROS 2 node that publishes numbered messages on several topics, once they have subscribers.
 
-Arguments: seconds, messages per second on /load/small. Prints SUBSCRIBED when all topics have a subscriber,
-then DONE with the numbers of published messages, as JSON. It runs on for late subscribers until it is ended.
+Arguments: least messages on /load/small, most of them per second, a window, and a folder. Its file ``taken`` has
+the number of the last one that a client has received; the node is at most the window ahead. It continues until
+there is a file ``enough``. Prints SUBSCRIBED when all topics have a subscriber, then DONE with the numbers of published
+messages, as JSON. It runs on for late subscribers until it is ended.
 """
 
 import json
 import signal
 import sys
 import time
+from pathlib import Path
 
 import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-SECONDS, RATE = float(sys.argv[1]), float(sys.argv[2])
-SMALL_BYTES, BIG_BYTES, BIG_RATE, UNSURE_RATE, BURST = 200, 20_000, 10.0, 50.0, 100
+LEAST, RATE, WINDOW, FOLDER = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
+SMALL_BYTES, BIG_BYTES, BURST = 200, 20_000, 100
+SMALL_PER_BIG, SMALL_PER_UNSURE = 100, 20
+PATIENCE = 1.0
+"""Seconds without progress of the client after which one more message is published: it may have missed the first."""
 
 rclpy.init()
 node = rclpy.create_node("publishes_much")
@@ -41,18 +47,32 @@ while not all(each.get_subscription_count() for name, each in publishers.items()
     time.sleep(0.05)
 print("SUBSCRIBED", flush=True)
 
-rates = {"small": (RATE, SMALL_BYTES), "big": (BIG_RATE, BIG_BYTES), "unsure": (UNSURE_RATE, SMALL_BYTES)}
-begun = time.monotonic()
-cpu = time.process_time()
-while (passed := time.monotonic() - begun) < SECONDS:
-    for name, (rate, size) in rates.items():
-        # At most 10 ms worth of messages at once, so a delayed process catches up slowly.
-        for _ in range(min(int(passed * rate) - sent[name], max(1, int(rate / 50)))):
-            publish(name, size)
+
+def taken():
+    """The number of the last message that a client has received."""
+    try:
+        return int((FOLDER / "taken").read_bytes() or b"0")
+    except FileNotFoundError:
+        return 0
+
+
+begun = moved = time.monotonic()
+last = 0
+while sent["small"] < LEAST or not (FOLDER / "enough").exists():
+    if (now_taken := taken()) != last:
+        last, moved = now_taken, time.monotonic()
+    due = min(int((time.monotonic() - begun) * RATE), last + WINDOW)
+    if time.monotonic() - moved > PATIENCE:
+        due, moved = sent["small"] + 1, time.monotonic()
+    # At most 20 ms worth of messages at once, so a delayed process catches up slowly.
+    for _ in range(min(due - sent["small"], max(1, int(RATE / 50)))):
+        publish("small", SMALL_BYTES)
+        if sent["small"] % SMALL_PER_BIG == 0:
+            publish("big", BIG_BYTES)
+        if sent["small"] % SMALL_PER_UNSURE == 0:
+            publish("unsure", SMALL_BYTES)
     time.sleep(0.002)
-took = time.monotonic() - begun
-cpu = time.process_time() - cpu
 for _ in range(BURST):
     publish("burst", SMALL_BYTES)
-print("DONE", json.dumps({**sent, "seconds": took, "cpu": cpu}), flush=True)
+print("DONE", json.dumps(sent), flush=True)
 signal.pause()

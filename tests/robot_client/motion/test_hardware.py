@@ -23,10 +23,21 @@ from robot_client.motion.hardware import KILL_SECONDS, SWITCH_SECONDS, Hardware,
 from robot_client.platforms.base import GraphView
 from tests.worlds.memory_platform import MemoryPlatform
 from tests.worlds.robot_failures import broken
+from tests.worlds.waiting import eventually
 
 PYTHON = sys.executable
 DONE, REFUSED = b"\0\1\0\0\1", b"\0\1\0\0" + bytes(9)
 """Answers of a service that stops the hardware, as CDR: a success as far as it is read, a failure without a word."""
+
+
+class TimelessPrograms:
+    """A reactor that runs real programs, however long they take: time passes only by its clock."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.callLater = self.clock.callLater
+        real: Any = reactor
+        self.spawnProcess = real.spawnProcess
 
 
 @pytest_twisted.ensureDeferred
@@ -39,7 +50,7 @@ async def test_programs_are_run_with_their_arguments_and_no_shell(tmp_path: Path
         return Path(out).read_text()
 
     switches = Switches("", [PYTHON, "-c", note, out, "$HOME; off"], [PYTHON, "-c", note, out, "on"])
-    switch = Hardware(switches, MemoryPlatform(), reactor)
+    switch = Hardware(switches, MemoryPlatform(), TimelessPrograms())
     assert await switch.stop() == []
     assert content() == "$HOME; off"
     assert await switch.resume() == []
@@ -51,7 +62,7 @@ async def test_failed_program_is_reported_with_its_last_line() -> None:
     """Its exit code, and the last line it wrote, harmless."""
     code = r"import sys; sys.exit('first\nno \x1b[31mpower')"
     switches = Switches(stop=[PYTHON, "-c", code])
-    (problem,) = await Hardware(switches, MemoryPlatform(), reactor).stop()
+    (problem,) = await Hardware(switches, MemoryPlatform(), TimelessPrograms()).stop()
     assert problem == rf"{PYTHON} ended with 1: no \x1b[31mpower"
 
 
@@ -73,31 +84,38 @@ async def test_missing_program_is_reported() -> None:
 @pytest_twisted.ensureDeferred
 async def test_stop_in_the_middle_of_a_slow_resume_has_the_last_word(tmp_path: Path) -> None:
     """The switch is set at once, and again when the resume's program has ended; only then the stop is done."""
-    note = "; pathlib.Path(sys.argv[1]).open('a').write(sys.argv[2])"
-    code = "import pathlib, sys, time; time.sleep(float(sys.argv[3]))" + note
     out = tmp_path / "out"
-    stop, resume = ([PYTHON, "-c", code, str(out), *each] for each in (("s", "0"), ("r", "0.5")))
-    switch = Hardware(Switches("", stop, resume), MemoryPlatform(), reactor)
+    note = "import pathlib, sys; out = pathlib.Path(sys.argv[1]); out.open('a').write('s')"
+    slow = (
+        "import pathlib, sys, time\nout = pathlib.Path(sys.argv[1])\nwhile not out.exists(): time.sleep(0.01)"
+    )
+    slow += "\nout.open('a').write('r')"
+    stop, resume = ([PYTHON, "-c", code, str(out)] for code in (note, slow))
+    switch = Hardware(Switches("", stop, resume), MemoryPlatform(), TimelessPrograms())
     resumed = switch.resume()
     assert await switch.stop() == []
     assert await resumed == []
-    assert sorted(out.read_text()) == ["r", "s", "s"]
-    assert out.read_text()[-1] == "s"
+    assert out.read_text() == "srs"
 
 
 @pytest_twisted.ensureDeferred
 async def test_stop_in_the_middle_of_a_resume_that_hangs_is_thrown_when_that_is_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     """The state left by a killed program is stopped too."""
-    monkeypatch.setattr(hardware, "SWITCH_SECONDS", 2.0)
     out = tmp_path / "out"
     note = "import pathlib, sys; pathlib.Path(sys.argv[1]).open('a').write(sys.argv[2])"
-    hang = note + "; import time; time.sleep(60)"
+    hang = note + "; import time; time.sleep(600)"
     switches = Switches("", [PYTHON, "-c", note, str(out), "s"], [PYTHON, "-c", hang, str(out), "r"])
-    switch = Hardware(switches, MemoryPlatform(), reactor)
+    programs = TimelessPrograms()
+    switch = Hardware(switches, MemoryPlatform(), programs)
     resumed = switch.resume()
-    assert await switch.stop() == []
+    stopped = switch.stop()
+    await eventually("the resume has written", lambda: out.exists() and "r" in out.read_text())
+    await eventually("the stop's program has ended", lambda: len(programs.clock.getDelayedCalls()) == 1)
+    assert sorted(out.read_text()) == ["r", "s"]
+    programs.clock.advance(SWITCH_SECONDS)
+    assert await stopped == []
     assert "did not end" in (await resumed)[0]
     assert sorted(out.read_text()) == ["r", "s", "s"]
     assert out.read_text()[-1] == "s"
