@@ -90,7 +90,9 @@ class Durations:
             f"all {len(self._seconds)} files: {self._seconds.total():.0f} s, {processor:.0f} s of processor"
         )
         for path, seconds in self._seconds.most_common(SHOWN):
-            terminalreporter.write_line(f"{seconds:5.0f} s  {self._processor[path]:5.0f} s of processor  {path}")
+            terminalreporter.write_line(
+                f"{seconds:5.0f} s  {self._processor[path]:5.0f} s of processor  {path}"
+            )
         if self._noted is not None:
             self._noted.write_text(
                 "".join(
