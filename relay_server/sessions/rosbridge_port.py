@@ -111,11 +111,14 @@ class RosbridgePort(WebsocketPort):
 
     def _add_fragment(self, fragment: rosbridge.Fragment) -> None:
         if self._fragments is None:
+            user_bytes = self._transport.unfinished
+            assert user_bytes is not None
             self._fragments = FragmentAssembler(
                 self._clock,
                 lambda: self._age.earliest_sent,
                 self._fragments_complete,
                 partial(self.status, "error"),
+                user_bytes,
                 self._timing.largest_message,
             )
         with self._quota.timed():
