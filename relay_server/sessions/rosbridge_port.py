@@ -173,7 +173,7 @@ class RosbridgePort(WebsocketPort):
         """Send a sample, or queue it; a queued sample is rendered when it can be sent."""
         queue = self.send_queue
         if not queue.passing:
-            lasting = self._client.channel.subscriptions.all_matter(subscription.topic)
+            lasting = self._client.channel.subscriptions.lasting(subscription.topic)
             queue.send_droppable(subscription, sample, subscription.depth or DATA_PER_TOPIC, lasting=lasting)
             return
         if subscription.format is sample.plain_format:

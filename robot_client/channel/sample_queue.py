@@ -4,6 +4,9 @@ While the transport has room, small samples pass in order of arrival. Between th
 samples, one subscription after the other, so that an image does not delay small samples. While the
 transport is full, each subscription keeps its latest samples (:data:`SUBSCRIPTION_BYTES`), at most 1 s old
 and at most 4 MiB in all. A sample of which a part was sent is always completed.
+
+Of a latched topic the newest samples, as many as it has publishers, are kept, since each may be the only one of
+its publisher; so are samples that are repeated for late joiners (:data:`LATCHED_BYTES`).
 """
 
 from __future__ import annotations
@@ -30,6 +33,9 @@ MAX_BYTES = 4 * MIB
 SUBSCRIPTION_BYTES = 256 * KIB
 """While the transport is full: most seconds a sample waits, most bytes in all, and most bytes of a subscription."""
 
+LATCHED_BYTES = ROBOT_FRAME
+"""Most bytes of latched samples that wait and are not replaced by newer ones; the relay stores no more."""
+
 LARGE = 16 * KIB
 """A sample of more bytes is sent in parts."""
 
@@ -38,8 +44,8 @@ LEAST_PART = 2 * KIB
 """Bytes of a part; fewer than :data:`PART` if the link has no room for more."""
 
 MAX_MISSED = 64
-"""Most latched samples of one inhibited subscription that are kept, one for each publisher. If there is
-more than one, together they have at most :data:`SUBSCRIPTION_BYTES`."""
+"""Most latched samples of one inhibited subscription that are kept. More than its publishers have at most
+:data:`SUBSCRIPTION_BYTES` together, one for each at most :data:`LATCHED_BYTES`."""
 
 TOO_LARGE = "too_large"
 SLOW_LINK = "slow_link"
@@ -206,6 +212,8 @@ class _SubscriptionQueue:
         self.throttle = throttle
         """Least seconds between two samples; 0 for no limit."""
         self.latched = latched
+        self.publishers = 1
+        """Of the topic; see :attr:`kept`."""
         self.waiting: deque[int] = deque()
         """Serial numbers of its samples, oldest first."""
         self.size = 0
@@ -228,6 +236,11 @@ class _SubscriptionQueue:
         """Body that replaces each sample while it is inhibited; ``None`` to send nothing."""
         self.missed: deque[_Sample] = deque(maxlen=MAX_MISSED)
         """Latched samples that arrived while it was inhibited: their publishers may not send another."""
+
+    @property
+    def kept(self) -> int:
+        """Number of its newest samples that are kept beyond :data:`SUBSCRIPTION_BYTES`."""
+        return max(1, self.publishers) if self.latched else 1
 
 
 class SampleQueue:
@@ -271,15 +284,19 @@ class SampleQueue:
         """No queued sample arrived before."""
         self._size = 0
 
-    def open(self, number: int, throttle: float = 0.0, latched: bool = False) -> None:
-        """Add a subscription, or change its throttle (seconds)."""
+    def open(self, number: int, throttle: float = 0.0, latched: bool = False, publishers: int = 1) -> None:
+        """Add a subscription, or change it.
+
+        :param throttle: seconds
+        :param publishers: how many the topic has
+        """
         queue = self._queues.get(number)
         if queue is None:
-            self._queues[number] = _SubscriptionQueue(throttle, latched)
-            return
+            queue = self._queues[number] = _SubscriptionQueue(throttle, latched)
         queue.next_at += throttle - queue.throttle
         queue.throttle = throttle
         queue.latched = latched
+        queue.publishers = publishers
 
     def close(self, number: int) -> None:
         """Remove a subscription and its samples; a begun sample is cancelled."""
@@ -311,11 +328,7 @@ class SampleQueue:
         if queue.inhibited:
             if queue.latched:
                 queue.missed.append(_Sample(number, now, stamp, body))
-                while (
-                    len(queue.missed) > 1
-                    and sum(len(each.body) for each in queue.missed) > SUBSCRIPTION_BYTES
-                ):
-                    queue.missed.popleft()
+                self._trim_missed(queue)
             if queue.held_value is None:
                 return False
             body = queue.held_value
@@ -517,13 +530,46 @@ class SampleQueue:
         return frame
 
     def _trim_queue(self, queue: _SubscriptionQueue) -> None:
-        while len(queue.waiting) > 1 and queue.size > SUBSCRIPTION_BYTES:
-            self._drop(queue.waiting[0])
+        if queue.size <= SUBSCRIPTION_BYTES:
+            return
+        for serial in self._replaceable(queue):
+            if queue.size <= SUBSCRIPTION_BYTES:
+                return
+            self._drop(serial)
+
+    def _replaceable(self, queue: _SubscriptionQueue) -> list[int]:
+        """Serial numbers of the waiting samples of a subscription that newer ones replace, oldest first."""
+        if not queue.latched:
+            return list(queue.waiting)[:-1]
+        return [serial for serial in queue.waiting if not self._sample(serial).repeated][: -queue.kept]
+
+    def _trim_missed(self, queue: _SubscriptionQueue) -> None:
+        size = sum(len(each.body) for each in queue.missed)
+        while len(queue.missed) > 1 and (
+            size > LATCHED_BYTES or (size > SUBSCRIPTION_BYTES and len(queue.missed) > queue.kept)
+        ):
+            dropped = queue.missed.popleft()
+            size -= len(dropped.body)
+            self._count_loss(dropped.number, SLOW_LINK, len(dropped.body))
 
     def _trim_all(self) -> None:
-        while self._size > MAX_BYTES and len(self._small) + len(self._large) > 1:
-            self._drop(min(next(iter(samples)) for samples in (self._small, self._large) if samples))
+        if self._size > MAX_BYTES:
+            kept = self._kept()
+            size = sum(len(self._sample(serial).body) for serial in kept)
+            others = sorted({*self._small, *self._large} - kept)
+            while self._size - size > MAX_BYTES and len(others) > 1:
+                self._drop(others.pop(0))
+            for serial in sorted(kept)[:-1]:
+                if size <= LATCHED_BYTES:
+                    break
+                size -= len(self._sample(serial).body)
+                self._drop(serial)
         self._trim_old()
+
+    def _kept(self) -> set[int]:
+        """Serial numbers of latched samples that newer ones do not replace."""
+        latched = (queue for queue in self._queues.values() if queue.latched and queue.waiting)
+        return {serial for queue in latched for serial in set(queue.waiting) - set(self._replaceable(queue))}
 
     def _trim_old(self) -> None:
         oldest = self._now() - MAX_AGE
@@ -568,6 +614,10 @@ class SampleQueue:
         queue.size -= len(sample.body)
         self._size -= len(sample.body)
         return sample
+
+    def _sample(self, serial: int) -> _Sample:
+        found = self._small.get(serial)
+        return self._large[serial] if found is None else found
 
     def _pop(self, serial: int) -> _Sample:
         return self._small.pop(serial) if serial in self._small else self._large.pop(serial)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from twisted.internet.task import Clock
 
 from relay_protocol.frames import PART, SAMPLE, FrameDecoder, SampleFrame
-from relay_protocol.limits import ROBOT_FRAME
+from relay_protocol.limits import MIB, ROBOT_FRAME
 from robot_client.channel.sample_queue import (
     LARGE,
     MAX_BYTES,
@@ -353,6 +353,51 @@ def test_held_subscription_repeats_the_last_sample_sent() -> None:
     queue.inhibit(1, hold=True)
     assert queue.enqueue(1, 7, b"d")
     assert FrameDecoder(2**25).feed(b"".join(queue.next_frames(1))) == [SampleFrame(1, 7, b"b")]
+
+
+def test_a_latched_sample_of_each_publisher_survives_a_full_transport() -> None:
+    """However large they are together, within a bound; more than the topic has publishers are replaced as others."""
+    queue = sample_queue(Clock())
+    queue.open(1, latched=True, publishers=10)
+    queue.open(2)
+    queue.paused = True
+    for number in range(12):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+        queue.enqueue(2, number, bytes([100 + number]) * 200_000)
+    queue.trim()
+    queue.paused = False
+    got = [body[0] for body in bodies(queue)]
+    assert [each for each in got if each < 100] == list(range(2, 12))
+    assert [each for each in got if each >= 100] == [111]
+    queue.paused = True
+    for number in range(10):
+        queue.enqueue(1, number, bytes([number]) * 2 * MIB)
+    queue.paused = False
+    assert [body[0] for body in bodies(queue)] == list(range(2, 10))
+
+
+def test_repeated_samples_survive_a_full_transport_too() -> None:
+    """They are of several publishers, and newer samples do not replace them."""
+    queue = sample_queue(Clock())
+    queue.open(1, latched=True, publishers=2)
+    queue.paused = True
+    for number in range(1, 5):
+        queue.enqueue_latched(1, number, bytes([number]) * 500_000)
+    queue.enqueue_latched(1, 0, b"")
+    for number in range(5, 9):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+    queue.paused = False
+    assert [body[:1] for body in bodies(queue)] == [b"\1", b"\2", b"\3", b"\4", b"", b"\7", b"\x08"]
+
+
+def test_an_inhibition_keeps_a_latched_sample_of_each_publisher() -> None:
+    queue = sample_queue(Clock())
+    queue.open(1, latched=True, publishers=10)
+    queue.inhibit(1, hold=False)
+    for number in range(11):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+    queue.end_inhibition(1)
+    assert [body[0] for body in bodies(queue)] == list(range(1, 11))
 
 
 def test_latched_samples_that_arrived_during_an_inhibition_are_sent_afterwards() -> None:
