@@ -6,12 +6,11 @@ The length counts the kind and the body. It is checked against the limit before 
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple
 
 import msgspec
 
 from relay_protocol.errors import FrameTooLarge, MalformedMessage
-from relay_protocol.limits import INCOMPLETE_SAMPLE_BYTES
+from relay_protocol.limits import INCOMPLETE_SAMPLE_BYTES, PART_SECONDS
 
 JSON = 0
 SAMPLE = 1
@@ -195,6 +194,21 @@ class FrameDecoder:
         """Bytes held of an incomplete frame and of incomplete samples."""
         return len(self._buffer) + self._parts.size
 
+    def drop_idle(self, now: float) -> None:
+        """Drop samples of which no part has come for :data:`relay_protocol.limits.PART_SECONDS`.
+
+        Called often; parts that come between two calls have the time of the first.
+
+        :param now: seconds of a monotonic clock
+        :raises MalformedMessage: such parts are of a JSON message
+        """
+        self._parts.drop_idle(now)
+
+    def clear(self) -> None:
+        """Drop all that is incomplete, as the link has ended."""
+        self._buffer = bytearray()
+        self._parts = _Parts()
+
     def feed(self, data: bytes) -> list[Frame]:
         """Take received bytes; return the frames that they complete.
 
@@ -242,10 +256,14 @@ class FrameDecoder:
         return frames
 
 
-class _Unfinished(NamedTuple):
-    stamp: int
-    total: int
-    body: bytearray
+class _Unfinished:
+    __slots__ = ("body", "stamp", "total", "touched")
+
+    def __init__(self, stamp: int, total: int, body: bytearray, touched: float) -> None:
+        self.stamp = stamp
+        self.total = total
+        self.body = body
+        self.touched = touched
 
 
 class _Parts:
@@ -254,6 +272,25 @@ class _Parts:
     def __init__(self) -> None:
         self.size = 0
         self._unfinished: dict[int, _Unfinished] = {}
+        self._dropped: dict[int, int] = {}
+        """Stamps of samples that were dropped as idle. Further parts of them are passed over."""
+        self._now = 0.0
+
+    def drop_idle(self, now: float) -> None:
+        self._now = now
+        if not self._unfinished:
+            return
+        for number in [
+            number for number, each in self._unfinished.items() if each.touched <= now - PART_SECONDS
+        ]:
+            if number == JSON_NUMBER:
+                raise MalformedMessage(
+                    f"no part of an unfinished JSON message has come for {PART_SECONDS:g} s"
+                )
+            self._dropped[number] = self._unfinished[number].stamp
+            self._drop(number)
+        while len(self._dropped) > UNFINISHED:
+            del self._dropped[next(iter(self._dropped))]
 
     def join(self, buffer: bytes, start: int, end: int, limit: int, largest: int) -> SampleFrame | None:
         """Take one part; return the sample that it completes.
@@ -272,6 +309,8 @@ class _Parts:
             largest = limit - 1
         if total > largest:
             raise FrameTooLarge(f"a sample of {total} bytes was announced; at most {largest} are taken here")
+        if self._dropped and offset and self._dropped.get(number) == stamp:
+            return None
         size = end - start - 21
         body = (
             self._begin(number, stamp, total) if offset == 0 else self._follow(number, stamp, total, offset)
@@ -294,8 +333,9 @@ class _Parts:
 
     def _begin(self, number: int, stamp: int, total: int) -> bytearray:
         self._drop(number)
+        self._dropped.pop(number, None)
         body = bytearray()
-        self._unfinished[number] = _Unfinished(stamp, total, body)
+        self._unfinished[number] = _Unfinished(stamp, total, body, self._now)
         return body
 
     def _follow(self, number: int, stamp: int, total: int, offset: int) -> bytearray:
@@ -306,6 +346,7 @@ class _Parts:
             raise MalformedMessage(f"the parts of sample {number} belong to different samples")
         if len(known.body) != offset:
             raise MalformedMessage(f"byte {len(known.body)} of sample {number} must be next, not {offset}")
+        known.touched = self._now
         return known.body
 
     def _drop(self, number: int) -> None:

@@ -91,11 +91,21 @@ PROCESSES = 512
 INCOMPLETE_SAMPLE_BYTES = 2 * ROBOT_FRAME
 """Most bytes of incomplete samples on one link."""
 
+PART_SECONDS = 60.0
+"""An incomplete sample on a robot link is dropped when no part of it has come for this time."""
+
 INCOMPLETE_MESSAGES = 16
 """Most incomplete messages of one client (rosbridge fragments)."""
 
 FRAGMENT_SECONDS = 10.0
 """An incomplete message is discarded after this time."""
+
+MESSAGE_SECONDS = 30.0
+MESSAGE_RATE = 16 * KIB
+"""A client must finish a message within this time, and one second more for each so many bytes of it."""
+
+UNFINISHED_MESSAGES = 4
+"""Unfinished messages of one user have as many bytes together, over all connections, as so many largest messages."""
 
 LABEL_LENGTH = 255
 """Longest fact about a robot (host, agent, …), characters."""

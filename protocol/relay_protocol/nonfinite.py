@@ -170,6 +170,40 @@ def marks_to_null(text: bytes) -> bytes:
     return _STRING_OR_NAME.sub(_null_for_mark, text)
 
 
+def require_finite(text: bytes) -> None:
+    """Refuse a command to move that has NaN, infinity, or ``null`` for a number.
+
+    :param text: JSON that was checked; NaN and infinity are marks
+    :raises NotFinite: with the field
+    :raises TooCostly: see :func:`relay_protocol.json_cost.check_odd`
+    """
+    # Marks have this escape, however they are written. Nearly all commands have neither.
+    if b"null" not in text and b"\\u0000" not in text:
+        return
+    json_cost.check_odd(text)
+    found = _not_finite(jsontext.decode_any(text))
+    if found is not None:
+        path, value = found
+        raise NotFinite(
+            f"{display_name(path) or 'the message'} must be finite in a command that moves the robot, not {value}"
+        )
+
+
+def _not_finite(value: Any, path: str = "") -> tuple[str, str] | None:
+    """Path and name of the first value that is ``null`` or a mark."""
+    if value is None:
+        return path, "null"
+    if type(value) is str:
+        return (path, value[1:]) if value in NUMBERS else None
+    if type(value) is dict:
+        parts = ((f"{path}.{name}" if path else name, each) for name, each in value.items())
+    elif type(value) is list:
+        parts = ((f"{path}[{index}]", each) for index, each in enumerate(value))
+    else:
+        return None
+    return next((found for name, each in parts if (found := _not_finite(each, name)) is not None), None)
+
+
 def _null_for_mark(match: re.Match[bytes]) -> bytes:
     return b"null" if match[1] in _WRITTEN and match[2] is None else match[0]
 

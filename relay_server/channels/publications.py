@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import orjson
 
-from relay_protocol import jsontext, link, rosbridge
+from relay_protocol import jsontext, link, nonfinite, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.link import QoS, Topic
@@ -328,6 +328,8 @@ class Publications:
             # The definition is known but is not that of a message, for example of a service.
             self.refused(publication.number, str(error))
             return None
+        if publication.motion:
+            convert = _finite(convert)
         publication.send = channel_link.message_sender(
             publication.number, convert, commands=publication.motion
         )
@@ -554,6 +556,17 @@ def _notify_unmatched(publication: RobotPublication, member: ChannelMember, id: 
 
 def _notify_dropped(publication: RobotPublication, message: QueuedMessage, reason: str) -> None:
     message.member.notify("error", f"publish {publication.topic}: {reason}", message.id)
+
+
+def _finite(convert: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """A converter of commands, which refuses numbers that are not finite."""
+
+    def convert_command(body: bytes) -> bytes:
+        converted = convert(body)
+        nonfinite.require_finite(body)
+        return converted
+
+    return convert_command
 
 
 def _json_of_unknown_type(body: bytes) -> bytes:

@@ -10,6 +10,7 @@ from relay_protocol import link
 from relay_protocol.errors import Invalid, Refused
 from relay_server.channels.client_subscription import ClientSubscription
 from relay_server.channels.definitions import Definitions
+from relay_server.channels.latched import MAX_SAMPLES
 from relay_server.channels.link_state import USER_TOPICS, RobotLinkState
 from relay_server.channels.members import ChannelMember
 from relay_server.channels.robot_requests import RequestPhase, RobotRequest
@@ -146,13 +147,16 @@ class Subscriptions:
         subscription = self._topics.get(topic)
         return subscription is not None and subscription.latched
 
-    def all_matter(self, topic: str) -> bool:
-        """Whether several publishers of a topic keep their last messages, so that the newest is not all that counts.
+    def lasting(self, topic: str) -> int:
+        """How many of the newest samples of a topic are not replaced by newer ones: one for each of several publishers
+        that keep their last messages; otherwise 0.
 
         Which publisher sent a message is not known (:mod:`relay_server.channels.latched`).
         """
         subscription = self._topics.get(topic)
-        return subscription is not None and subscription.latched and subscription.publishers > 1
+        if subscription is None or not subscription.latched or subscription.publishers < 2:
+            return 0
+        return min(subscription.publishers, MAX_SAMPLES)
 
     def type_for(self, member: ChannelMember, topic: str) -> str:
         """The type that clients name for a topic that the robot does not have; empty: none."""

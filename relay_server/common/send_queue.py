@@ -10,10 +10,14 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
-from relay_protocol.limits import MIB
+from relay_protocol.limits import MIB, ROBOT_FRAME
 
 DATA_BYTES = 2 * MIB
 """Most bytes of samples that wait for one receiver."""
+
+LASTING_BYTES = ROBOT_FRAME
+"""Most bytes of samples that wait for one receiver and are not replaced by newer ones; they count only for this limit.
+The relay holds them anyway (:mod:`relay_server.channels.latched`)."""
 
 DATA_PER_TOPIC = 128
 """Most samples of one topic that wait."""
@@ -58,7 +62,7 @@ class _TopicQueue:
 
     :ivar commands: whether they are commands
     :ivar counted: whether their bytes count for the limits
-    :ivar lasting: whether they do not become stale
+    :ivar lasting: how many of the newest are not replaced by newer ones; then none becomes stale either
     """
 
     __slots__ = ("bytes", "commands", "counted", "key", "lasting", "samples")
@@ -67,9 +71,14 @@ class _TopicQueue:
         self.key = key
         self.commands = commands
         self.counted = True
-        self.lasting = False
+        self.lasting = 0
         self.samples: deque[tuple[float, int, bytes | LazyMessage, int]] = deque()
         self.bytes = 0
+
+    @property
+    def all_last(self) -> bool:
+        """Whether none of its samples is replaced by a newer one."""
+        return len(self.samples) <= self.lasting
 
 
 class SendQueue:
@@ -315,7 +324,7 @@ class SendQueue:
         depth: int = DATA_PER_TOPIC,
         *,
         commands: bool = False,
-        lasting: bool = False,
+        lasting: int = 0,
         source: int = 0,
     ) -> None:
         """Send a sample of a topic, or queue it; the oldest are dropped beyond the limits.
@@ -323,8 +332,8 @@ class SendQueue:
         :param key: the topic; a :class:`LazyMessage` is rendered with it
         :param depth: most samples of this topic that wait, at least one
         :param commands: whether samples of this topic are commands, which are all bytes
-        :param lasting: whether newer samples of this topic do not replace older ones, so that age drops none, and
-            those of other topics are dropped first
+        :param lasting: how many of the newest samples of this topic are not replaced by newer ones, as each may be of
+            another publisher; then age drops none, and those of other topics are dropped first
         :param source: number of the connection of the client that has published it, for :attr:`on_drop`
         """
         if not self._must_wait(key, message):
@@ -334,16 +343,11 @@ class SendQueue:
             queue = self._data[key] = _TopicQueue(key, commands)
         queue.lasting = lasting
         self._enqueue(queue, message, source)
-        while len(queue.samples) > max(depth, 1):
+        while len(queue.samples) > max(depth, lasting, 1):
             self._drop_oldest(queue)
         if self._data_bytes > DATA_BYTES:
             self._evict()
-        while self._data_bytes > 2 * DATA_BYTES and queue.samples:
-            if len(queue.samples) == 1 and self._data_bytes - queue.bytes <= DATA_BYTES:
-                # A single sample is kept whatever its size, if little else waits.
-                break
-            # Single samples of many topics: not even the newest of each can be kept.
-            self._drop_oldest(queue)
+            self._bound(queue)
         if not queue.samples:
             del self._data[key]
         if self._open:
@@ -410,15 +414,37 @@ class SendQueue:
         if queue is not None:
             self._data_bytes -= queue.bytes
 
+    def _bound(self, queue: _TopicQueue) -> None:
+        """Drop what :meth:`_evict` has left, if that is still too much, from the topic of the latest sample."""
+        lasting = self._lasting_bytes()
+        if queue.all_last:
+            while lasting > LASTING_BYTES and len(queue.samples) > 1:
+                lasting -= queue.samples[0][1]
+                self._drop_oldest(queue)
+            return
+        while self._data_bytes - lasting > 2 * DATA_BYTES and queue.samples:
+            if len(queue.samples) == 1 and self._data_bytes - lasting - queue.bytes <= DATA_BYTES:
+                # A single sample is kept whatever its size, if little else waits.
+                break
+            # Single samples of many topics: not even the newest of each can be kept.
+            self._drop_oldest(queue)
+
+    def _lasting_bytes(self) -> int:
+        """Bytes of the topics of which all samples last."""
+        return sum(queue.bytes for queue in self._data.values() if queue.all_last)
+
     def _evict(self) -> None:
-        """Drop from the fullest topic first, lasting ones at the end; each keeps its newest sample."""
-        while self._data_bytes > DATA_BYTES:
-            several = [queue for queue in self._data.values() if len(queue.samples) > 1]
+        """Drop from the fullest topic first, lasting ones at the end; each keeps its newest sample, and those that
+        last.
+        """
+        while self._data_bytes - self._lasting_bytes() > DATA_BYTES:
+            several = [queue for queue in self._data.values() if len(queue.samples) > max(1, queue.lasting)]
             if not several:
                 return
             fullest = max(several, key=lambda queue: (not queue.lasting, queue.bytes))
             # Drop a quarter at once, so that not every further sample costs a search.
-            for _ in range(max(1, len(fullest.samples) // 4)):
+            more = len(fullest.samples) - max(1, fullest.lasting)
+            for _ in range(min(more, max(1, len(fullest.samples) // 4))):
                 self._drop_oldest(fullest)
 
     def _forget_stale(self, queue: _TopicQueue) -> None:

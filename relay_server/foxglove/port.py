@@ -343,7 +343,7 @@ class FoxglovePort(WebsocketPort):
             sample.size > LARGE and not subscriptions.latched(topic) and not self._topics.is_cumulative(topic)
         )
         depth = 1 if newest_only else DATA_PER_TOPIC
-        queue.send_droppable(subscription, sample, depth, lasting=subscriptions.all_matter(topic))
+        queue.send_droppable(subscription, sample, depth, lasting=subscriptions.lasting(topic))
 
     def _render(self, key: ClientSubscription | AssetKey, message: Sample | WaitingAsset) -> bytes | None:
         if isinstance(message, WaitingAsset):

@@ -86,7 +86,13 @@ def build_http(services: Services, local: IResource) -> HttpSite:
     :param local: the resource of the local socket; the other relays pass on some of what theirs get
     """
     core, settings = services.core, services.core.settings
-    limits = RequestLimits(settings.requests, time.monotonic, settings.streams, settings.answer_seconds)
+    limits = RequestLimits(
+        settings.requests,
+        time.monotonic,
+        settings.streams,
+        settings.answer_seconds,
+        settings.largest_message,
+    )
     shown: dict[str, Source] = {
         "robots": services.sessions.overview.shared,
         "alerts": services.alerts.service.shown,

@@ -12,10 +12,11 @@ from twisted.internet.defer import CancelledError, Deferred
 from twisted.web.server import Request
 
 from relay_protocol.errors import SwitchboardError, Unavailable
-from relay_protocol.limits import FUNCTION_BODY, MIB
+from relay_protocol.limits import CLIENT_MESSAGE, FUNCTION_BODY, MIB, UNFINISHED_MESSAGES
 from relay_server.auth.login_limiter import network_of
 from relay_server.common.clock import Timer, cancel
 from relay_server.common.token_bucket import Buckets
+from relay_server.common.unfinished import UnfinishedBytes
 
 UNAUTHENTICATED = 2000
 """Most unauthenticated connections of all networks."""
@@ -195,17 +196,25 @@ class TooManyStreams(SwitchboardError):
 
 
 class RequestLimits:
-    """Counts each request once, and puts the remaining number into its answer. Counts open streams.
+    """Counts each request once, and puts the remaining number into its answer. Counts open streams, and bytes of
+    websocket messages that are unfinished.
 
     :param rate: requests per second of one user or network in the long run; 0 for no limit
     :param seconds: a monotonic clock
     :param answer_seconds: time limit of a request (:mod:`relay_server.http.limits`); 0 for no limit
     :param streams: streams that one user may have open, including websockets of pages and cameras; 0 for no limit
+    :param largest_message: bytes of the largest websocket message
     """
 
     def __init__(
-        self, rate: float, seconds: Callable[[], float], streams: int = 0, answer_seconds: float = 0.0
+        self,
+        rate: float,
+        seconds: Callable[[], float],
+        streams: int = 0,
+        answer_seconds: float = 0.0,
+        largest_message: int = CLIENT_MESSAGE,
     ) -> None:
+        self.unfinished = UnfinishedBytes(UNFINISHED_MESSAGES * largest_message)
         self.answer_seconds = answer_seconds
         self._rate = rate
         self._most_streams = streams

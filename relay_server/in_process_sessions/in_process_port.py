@@ -17,7 +17,7 @@ from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError, Unavailable
 from relay_server.channels.client_subscription import QUEUE_BYTES, ClientSubscription
 from relay_server.channels.samples import RenderError, Sample
-from relay_server.common.send_queue import DATA_PER_TOPIC
+from relay_server.common.send_queue import DATA_PER_TOPIC, LASTING_BYTES
 from relay_server.sessions.context import ClientContext
 from relay_server.sessions.session import Session
 
@@ -272,10 +272,14 @@ class InProcessPort:
     def _enqueue(self, waiting: deque[Sample], subscription: ClientSubscription, sample: Sample) -> None:
         """Queue a sample while paused, and drop older ones."""
         waiting.append(sample)
-        all_matter = self.client.channel.subscriptions.all_matter(subscription.topic)
-        most = DATA_PER_TOPIC if all_matter else 1
-        while len(waiting) > most or (len(waiting) > 1 and sum(each.size for each in waiting) > QUEUE_BYTES):
-            waiting.popleft()
+        lasting = self.client.channel.subscriptions.lasting(subscription.topic)
+        most, size = max(DATA_PER_TOPIC, lasting) if lasting else 1, sum(each.size for each in waiting)
+        while len(waiting) > 1 and (
+            len(waiting) > most
+            or (size > QUEUE_BYTES and len(waiting) > lasting)
+            or (lasting and size > LASTING_BYTES)
+        ):
+            size -= waiting.popleft().size
             self.dropped(subscription)
             subscription.too_slow(READ_TOO_SLOWLY)
 

@@ -180,12 +180,13 @@ async def ask_node(
         if found is None or not found.types:
             raise NotFound(f"there is no node {node} with parameters on robot {client.robot.name}")
     client.quota.count_robot_request()
+    args = jsontext.encode(nonfinite.from_floats(request))
     answer = await client.channel.requests.call(
         name,
         found.types[0],
-        jsontext.encode(nonfinite.from_floats(request)),
+        args,
         seconds,
-        call_context(client, name, client.earliest_sent if earliest_sent is None else earliest_sent),
+        call_context(client, name, client.earliest_sent if earliest_sent is None else earliest_sent, args),
     )
     with client.quota.counted():
         return jsontext.decode_any(answer)

@@ -471,6 +471,11 @@ class RobotConnection(TwistedProtocol):
             self._end(f"silent for {silent:.1f} s")
             self.transport.abortConnection()
             return
+        try:
+            self._decoder.drop_idle(self._clock.seconds())
+        except PeerError as error:
+            self._protocol_broken(error)
+            return
         self._ping(None)
 
     def _not_authenticated(self) -> None:
@@ -531,6 +536,8 @@ class RobotConnection(TwistedProtocol):
         self._replies.clear()
         self.reply_bytes = 0
         self._waiting.clear()
+        # The connection may be part of a cycle, which is freed much later.
+        self._decoder.clear()
         if self._heartbeat.running:
             self._heartbeat.stop()
         pings, self._pings = self._pings, OrderedDict()

@@ -521,4 +521,5 @@ class VideoLinkHandler(LinkHandler):
 
     def lost(self, reason: str) -> None:
         """The link has ended."""
+        self._parts.drop()
         self._stream.lost(self._connection)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from relay_protocol import limits, rosbridge
 from relay_protocol.errors import Invalid, Refused
 from relay_server.common.clock import Clock, Timer, cancel
+from relay_server.common.unfinished import PIECE_OVERHEAD, UnfinishedCount, time_limit
 
 PARTS = 16_384
 """Most fragments of one message, and of all incomplete messages of a client; each takes memory beside its bytes."""
@@ -15,14 +16,25 @@ PARTS = 16_384
 class _Incomplete:
     """A message of which some fragments have come."""
 
-    __slots__ = ("bytes", "earliest_sent", "parts", "total", "touched")
+    __slots__ = ("begun", "bytes", "earliest_sent", "parts", "total", "touched")
 
-    def __init__(self, total: int, earliest_sent: int) -> None:
+    def __init__(self, total: int, earliest_sent: int, begun: float) -> None:
         self.total = total
+        self.begun = begun
         self.earliest_sent = earliest_sent
         self.parts: dict[int, bytes] = {}
         self.bytes = 0
-        self.touched = 0.0
+        self.touched = begun
+
+    @property
+    def held(self) -> int:
+        """Bytes that it counts for."""
+        return self.bytes + PIECE_OVERHEAD * len(self.parts)
+
+    @property
+    def expires(self) -> float:
+        """Seconds of the clock at which it is dropped if no further fragment comes."""
+        return min(self.touched + limits.FRAGMENT_SECONDS, self.begun + time_limit(self.bytes))
 
 
 class FragmentAssembler:
@@ -31,8 +43,9 @@ class FragmentAssembler:
     :param earliest_sent: of a message that comes now; see :class:`relay_server.sessions.message_age.MessageAge`
     :param on_complete: called with the text of a whole message, and ``earliest_sent`` of its first fragment, as a
         command is as old as its beginning
+    :param on_expire: called with an error text and the id of a message whose fragments came too slowly
+    :param user_bytes: counts their bytes against the user
     :param most: most bytes of all incomplete messages together
-    :param on_expire: called with an error text and the id of a message whose fragments stopped coming
     """
 
     # Every client has one, and few use it.
@@ -47,6 +60,7 @@ class FragmentAssembler:
         "_on_expire",
         "_parts",
         "_timer",
+        "_user_bytes",
     )
 
     def __init__(
@@ -55,12 +69,14 @@ class FragmentAssembler:
         earliest_sent: Callable[[], int],
         on_complete: Callable[[bytes, int], None],
         on_expire: Callable[[str, rosbridge.Id], None],
+        user_bytes: UnfinishedCount,
         most: int = limits.CLIENT_MESSAGE,
     ) -> None:
         self._clock = clock
         self._earliest_sent = earliest_sent
         self._on_complete = on_complete
         self._on_expire = on_expire
+        self._user_bytes = user_bytes
         self._most = most
         self._incomplete: dict[str | int, _Incomplete] = {}
         self._dropped: dict[str | int, None] = {}
@@ -70,7 +86,8 @@ class FragmentAssembler:
 
     def end(self) -> None:
         """The client is gone."""
-        self._incomplete.clear()
+        for id in list(self._incomplete):
+            self._remove(id)
         cancel(self._timer)
         self._timer = None
 
@@ -104,7 +121,9 @@ class FragmentAssembler:
         if message is None:
             if len(self._incomplete) >= limits.INCOMPLETE_MESSAGES:
                 raise Refused(f"{limits.INCOMPLETE_MESSAGES} messages in fragments are unfinished already")
-            message = self._incomplete[part.id] = _Incomplete(part.total, self._earliest_sent())
+            message = self._incomplete[part.id] = _Incomplete(
+                part.total, self._earliest_sent(), self._clock.seconds()
+            )
         if part.total != message.total:
             raise Invalid(f"'total' was {message.total} before and is {part.total} now")
         if part.num in message.parts:
@@ -113,6 +132,8 @@ class FragmentAssembler:
             raise Refused(f"messages in fragments have more than {self._most} bytes together")
         if self._parts >= PARTS:
             raise Refused(f"messages in fragments have more than {PARTS} fragments together")
+        if not self._user_bytes.take(len(data) + PIECE_OVERHEAD):
+            raise Refused(self._user_bytes.refusal)
         message.parts[part.num] = data
         message.bytes += len(data)
         message.touched = self._clock.seconds()
@@ -127,6 +148,7 @@ class FragmentAssembler:
         if message is not None:
             self._parts -= len(message.parts)
             self._bytes -= message.bytes
+            self._user_bytes.give_back(message.held)
         return message
 
     def _drop(self, id: str | int) -> None:
@@ -136,19 +158,23 @@ class FragmentAssembler:
             self._dropped.pop(next(iter(self._dropped)))
 
     def _expire(self) -> None:
-        """Drop messages of which no fragment has come for :data:`relay_protocol.limits.FRAGMENT_SECONDS`."""
+        """Drop messages whose fragments have stopped coming, or come too slowly."""
         self._timer = None
-        oldest = self._clock.seconds() - limits.FRAGMENT_SECONDS
-        for id in [id for id, each in self._incomplete.items() if each.touched <= oldest]:
+        now = self._clock.seconds()
+        for id in [id for id, each in self._incomplete.items() if each.expires <= now]:
             message = self._remove(id)
             assert message is not None
+            stopped = now >= message.touched + limits.FRAGMENT_SECONDS
+            when = (
+                f"came, and then none for {limits.FRAGMENT_SECONDS:g}"
+                if stopped
+                else f"came in {now - message.begun:.0f}"
+            )
             self._on_expire(
-                f"a message in fragments is dropped: {len(message.parts)} of {message.total} came, "
-                f"and then none for {limits.FRAGMENT_SECONDS:g} s",
-                id,
+                f"a message in fragments is dropped: {len(message.parts)} of {message.total} {when} s", id
             )
         if self._incomplete:
-            next_at = min(each.touched for each in self._incomplete.values()) + limits.FRAGMENT_SECONDS
+            next_at = min(each.expires for each in self._incomplete.values())
             self._timer = self._clock.callLater(max(0.0, next_at - self._clock.seconds()), self._expire)
 
 

@@ -61,7 +61,8 @@ class ActionGoalHandler:
         client.require(Operation.CALL, action)
         moves = client.robot.description.motion.moves_by_action(action)
         earliest_sent = client.earliest_sent
-        motion_request = MotionRequest(client, f"a goal for {action}", earliest_sent) if moves else None
+        args = bytes(operation.args or b"")
+        motion_request = MotionRequest(client, f"a goal for {action}", earliest_sent, args) if moves else None
         type_name = normal_type(operation.action_type, "action")
         self._check_room(operation)
         requested_encoding(operation, client.notify)
@@ -74,7 +75,7 @@ class ActionGoalHandler:
             goal,
             action,
             type_name,
-            bytes(operation.args or b""),
+            args,
             RequestContext(client.number, earliest_sent, motion_request),
             feedback=operation.feedback,
         )

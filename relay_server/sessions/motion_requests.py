@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from relay_protocol import nonfinite
 from relay_protocol.errors import Refused
 from relay_server.channels.members import RequestContext
 from relay_server.sessions.context import ClientContext
 
 
-def call_context(client: ClientContext, service: str, earliest_sent: int) -> RequestContext:
+def call_context(client: ClientContext, service: str, earliest_sent: int, args: bytes) -> RequestContext:
     """The context of a service call; a call that moves the robot acquires control of it.
 
     :param earliest_sent: see :class:`relay_server.sessions.message_age.MessageAge`
+    :param args: JSON
+    :raises NotFinite: it moves the robot, and a number is not finite
     :raises Refused: it may be too old, another client has control, or control must be taken first
     """
     moves = client.robot.description.motion.moves_by_service(service)
-    motion_request = MotionRequest(client, f"a call of {service}", earliest_sent) if moves else None
+    motion_request = MotionRequest(client, f"a call of {service}", earliest_sent, args) if moves else None
     return RequestContext(client.number, earliest_sent, motion_request)
 
 
@@ -34,15 +37,18 @@ class MotionRequest:
 
     :param what: description of the request, for error texts
     :param earliest_sent: see :class:`relay_server.sessions.message_age.MessageAge`
+    :param args: JSON of its arguments, which is not kept
+    :raises NotFinite: a number in it is not finite
     :raises Refused: it may be too old, another client has control, or control must be taken first
     """
 
-    def __init__(self, client: ClientContext, what: str, earliest_sent: int) -> None:
+    def __init__(self, client: ClientContext, what: str, earliest_sent: int, args: bytes) -> None:
         self._client = client
         self._what = what
         self._earliest_sent = earliest_sent
         # A request that is too old must not even acquire control.
         self.check_age()
+        nonfinite.require_finite(args)
         client.controller.acquire_by_command(client)
         client.motion.last_command = client.motion.last_motion = client.earliest_sent
 

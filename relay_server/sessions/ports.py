@@ -15,6 +15,7 @@ from relay_protocol import limits, rosbridge
 from relay_server.channels.client_subscription import ClientSubscription
 from relay_server.channels.offered_services import ProviderPort
 from relay_server.channels.samples import Sample
+from relay_server.common.unfinished import UnfinishedCount
 
 
 class ClientPort(ProviderPort, Protocol):
@@ -93,6 +94,10 @@ class ClientPort(ProviderPort, Protocol):
 
 class ClientTransport(Protocol):
     """The websocket of a session: a :class:`~relay_server.ws.connection.ClientConnection`."""
+
+    @property
+    def unfinished(self) -> UnfinishedCount | None:
+        """Counts bytes of unfinished messages of the user; set before the session begins."""
 
     def send(self, frames: bytes) -> None:
         """Send one or more whole websocket frames, see :mod:`relay_server.common.websocket_frames`."""

@@ -111,11 +111,14 @@ class RosbridgePort(WebsocketPort):
 
     def _add_fragment(self, fragment: rosbridge.Fragment) -> None:
         if self._fragments is None:
+            user_bytes = self._transport.unfinished
+            assert user_bytes is not None
             self._fragments = FragmentAssembler(
                 self._clock,
                 lambda: self._age.earliest_sent,
                 self._fragments_complete,
                 partial(self.status, "error"),
+                user_bytes,
                 self._timing.largest_message,
             )
         with self._quota.timed():
@@ -170,7 +173,7 @@ class RosbridgePort(WebsocketPort):
         """Send a sample, or queue it; a queued sample is rendered when it can be sent."""
         queue = self.send_queue
         if not queue.passing:
-            lasting = self._client.channel.subscriptions.all_matter(subscription.topic)
+            lasting = self._client.channel.subscriptions.lasting(subscription.topic)
             queue.send_droppable(subscription, sample, subscription.depth or DATA_PER_TOPIC, lasting=lasting)
             return
         if subscription.format is sample.plain_format:

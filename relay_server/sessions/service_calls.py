@@ -77,7 +77,7 @@ class ServiceCallHandler:
                 normal_type(operation.type, "srv"),
                 raw,
                 operation.timeout,
-                call_context(self._client, service, self._client.earliest_sent),
+                call_context(self._client, service, self._client.earliest_sent, raw),
             )
         else:
             answer = self._call_local(local, _arguments(service, raw), is_stopping_call(operation))

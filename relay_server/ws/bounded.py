@@ -17,6 +17,7 @@ from relay_server.common import close_codes
 from relay_server.common.clock import Clock, Timer, cancel
 from relay_server.common.socket_writer import FlushScheduler, TransportWriter, writer_for
 from relay_server.common.tcp import PushProducer, tcp_of
+from relay_server.common.unfinished import PIECE_OVERHEAD, UnfinishedCount, time_limit
 from relay_server.ws.fast_receive import FastProtocol
 
 HANDSHAKE_ATTRIBUTES = (
@@ -63,6 +64,16 @@ class BoundedProtocol(FastProtocol):
 
     factory: BoundedFactory
     _writer: TransportWriter
+    inside_message = False
+    """Autobahn's: whether some frames of a message have come, and not all."""
+    unfinished: UnfinishedCount | None = None
+    """Counts bytes of unfinished messages; ``None`` before authentication, where few are taken."""
+    _unfinished_bytes = 0
+    """Bytes that the unfinished message counts for."""
+    _begun = 0.0
+    """Seconds of the clock at which it began."""
+    _message_timer: Timer | None = None
+    """Runs from the first unfinished message, so that there is no timer for each."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -91,6 +102,13 @@ class BoundedProtocol(FastProtocol):
         """The connection that began as an HTTP request is gone."""
         cancel(self._abort_timer)
         super().connectionLost(reason)
+        # The connection may be part of a cycle, which is freed much later.
+        self._drop_unfinished()
+        self._unread = None
+        self.data = b""
+        cancel(self._message_timer)
+        if self.unfinished is not None:
+            self.unfinished.close()
 
     def limit_message_size(self, size: int) -> None:
         """Set the most bytes of a message."""
@@ -120,6 +138,15 @@ class BoundedProtocol(FastProtocol):
         """A frame of a message begins."""
         super().onMessageFrameBegin(length)
         self._check_pieces()
+        # A last frame that has arrived whole is not held.
+        if (self._passing_left or not self.current_frame.fin) and not self.failedByMe:
+            self.hold(length)
+
+    def onMessageEnd(self) -> None:
+        """All frames of a message have come."""
+        if self._unfinished_bytes:
+            self.release()
+        super().onMessageEnd()
 
     def onMessageFrameData(self, payload: bytes) -> None:
         """A part of a frame has come."""
@@ -133,6 +160,56 @@ class BoundedProtocol(FastProtocol):
             self._max_message_size_exceeded(
                 pieces, MAX_PIECES, f"a message came in more than {MAX_PIECES} pieces"
             )
+
+    def hold(self, size: int) -> bool:
+        """Count a frame of an unfinished message; false if its user has too many bytes, so the connection fails."""
+        if self.unfinished is None:
+            return True
+        size += PIECE_OVERHEAD
+        if not self.unfinished.take(size):
+            self._fail_unfinished(close_codes.TOO_BIG, self.unfinished.refusal)
+            return False
+        if not self._unfinished_bytes:
+            self._begun = self.factory.clock.seconds()
+        self._unfinished_bytes += size
+        if self._message_timer is None:
+            self._message_timer = self.factory.clock.callLater(time_limit(0), self._check_time)
+        return True
+
+    def release(self) -> None:
+        """The message is complete, or dropped."""
+        if self._unfinished_bytes and self.unfinished is not None:
+            self.unfinished.give_back(self._unfinished_bytes)
+        self._unfinished_bytes = 0
+
+    def _check_time(self) -> None:
+        self._message_timer = None
+        if not self._unfinished_bytes or self.state != self.STATE_OPEN:
+            return
+        now, limit = self.factory.clock.seconds(), time_limit(self._unfinished_bytes)
+        if now < self._begun + limit:
+            self._message_timer = self.factory.clock.callLater(self._begun + limit - now, self._check_time)
+        else:
+            self._fail_unfinished(close_codes.TOO_SLOW, f"a message was not finished within {limit:.0f} s")
+
+    def _fail_unfinished(self, code: int, reason: str) -> None:
+        self._fail_connection(code, reason)
+        frame = self._drop_unfinished()
+        if frame is not None:
+            # Autobahn keeps nothing more of a connection that has failed, but it must know where the frame ends.
+            self._all_to_autobahn(bytes(frame), 0)
+
+    def _drop_unfinished(self) -> bytearray | None:
+        """Drop what has come of a message; returns the part of a frame that Autobahn has not read."""
+        if self.inside_message:
+            self.message_data: list[bytes] = []
+            self.frame_data: list[bytes] = []
+        frame = None
+        if self._holding_frame:
+            frame, self._unread = self._unread, None
+            self._holding_frame = False
+        self.release()
+        return frame
 
     def _invalid_payload(self, reason: str) -> bool:
         """Fail the connection once for a message, so that the client can answer the close frame.

@@ -267,6 +267,7 @@ class ClientConnection(BoundedProtocol):
         if self._lost:
             # The connection was lost during authentication; a stream counted now would never be released.
             raise Unavailable("the client has left")
+        self.unfinished = self.factory.request_limits.unfinished.count(principal.user_id)
         if self.is_stream:
             self._end_stream = self.factory.request_limits.stream(principal.user_id)
         admission = await self.factory.sessions.admit(principal, self._robot, self._address())

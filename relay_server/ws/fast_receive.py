@@ -63,6 +63,8 @@ class FastProtocol(WebSocketServerProtocol):
         super().__init__()
         self._unread: bytearray | None = None
         """Bytes from the start of a frame, while the frame is incomplete or the client's share is used up."""
+        self._holding_frame = False
+        """Whether :attr:`_unread` is an incomplete frame for which :meth:`hold` was called."""
         self._bytes_needed = 0
         """Length of :attr:`_unread` from which reading can continue."""
         self._passing_left = 0
@@ -83,6 +85,9 @@ class FastProtocol(WebSocketServerProtocol):
                 return
             data = bytes(waiting)
             self._unread = None
+            if self._holding_frame:
+                self._holding_frame = False
+                self.release()
         self._read(data)
 
     def _read(self, data: bytes) -> None:
@@ -113,7 +118,7 @@ class FastProtocol(WebSocketServerProtocol):
             if start and length <= limit:
                 end = start + length
                 if end > size:
-                    self._buffer(data, at, end - at)
+                    self._begin_frame(data, at, end - at)
                     return
                 payload = data[start:end] if length <= _COPY_LIMIT else memoryview(data)[start:end]
                 payload = apply_mask(payload, mask)
@@ -140,6 +145,21 @@ class FastProtocol(WebSocketServerProtocol):
             if at < size and seconds() > until:
                 self._pause(data, at)
                 return
+
+    def hold(self, size: int) -> bool:
+        """Whether an incomplete frame may be held. If not, the connection has failed."""
+        return True
+
+    def release(self) -> None:
+        """What was held is complete."""
+
+    def _begin_frame(self, data: bytes, at: int, size: int) -> None:
+        """Hold the incomplete frame at ``at``."""
+        if self.hold(size):
+            self._holding_frame = True
+            self._buffer(data, at, size)
+        else:
+            self._all_to_autobahn(data, at)
 
     def _buffer(self, data: bytes, at: int, needed: int) -> None:
         self._unread = bytearray(memoryview(data)[at:])

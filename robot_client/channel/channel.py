@@ -323,7 +323,7 @@ class RobotChannel:
         if subscription is None:
             return
         handle, request = subscription.handle, subscription.request
-        self.sample_queue.open(number, request.throttle_ms / 1000, handle.latched)
+        self.sample_queue.open(number, request.throttle_ms / 1000, handle.latched, handle.publishers)
         self._writer.send(
             link.Subscribed(
                 number=number,

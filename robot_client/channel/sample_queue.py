@@ -1,9 +1,12 @@
 """Queues samples for the relay: throttled, bounded, the newest kept, large ones in parts.
 
-While the transport has room, small samples pass in order of arrival. Between them go parts of large
-samples, one subscription after the other, so that an image does not delay small samples. While the
+While the transport has room, small samples pass in order of arrival. Middling ones follow, and between them go
+parts of large samples, one subscription after the other, so that neither delays small samples. While the
 transport is full, each subscription keeps its latest samples (:data:`SUBSCRIPTION_BYTES`), at most 1 s old
 and at most 4 MiB in all. A sample of which a part was sent is always completed.
+
+Of a latched topic the newest samples, as many as it has publishers, are kept, since each may be the only one of
+its publisher; so are samples that are repeated for late joiners (:data:`LATCHED_BYTES`).
 """
 
 from __future__ import annotations
@@ -30,6 +33,12 @@ MAX_BYTES = 4 * MIB
 SUBSCRIPTION_BYTES = 256 * KIB
 """While the transport is full: most seconds a sample waits, most bytes in all, and most bytes of a subscription."""
 
+LATCHED_BYTES = ROBOT_FRAME
+"""Most bytes of latched samples that wait and are not replaced by newer ones; the relay stores no more."""
+
+MIDDLING = 2 * KIB
+"""A sample of more bytes is sent after smaller ones of other subscriptions."""
+
 LARGE = 16 * KIB
 """A sample of more bytes is sent in parts."""
 
@@ -38,8 +47,8 @@ LEAST_PART = 2 * KIB
 """Bytes of a part; fewer than :data:`PART` if the link has no room for more."""
 
 MAX_MISSED = 64
-"""Most latched samples of one inhibited subscription that are kept, one for each publisher. If there is
-more than one, together they have at most :data:`SUBSCRIPTION_BYTES`."""
+"""Most latched samples of one inhibited subscription that are kept. More than its publishers have at most
+:data:`SUBSCRIPTION_BYTES` together, one for each at most :data:`LATCHED_BYTES`."""
 
 TOO_LARGE = "too_large"
 SLOW_LINK = "slow_link"
@@ -206,6 +215,8 @@ class _SubscriptionQueue:
         self.throttle = throttle
         """Least seconds between two samples; 0 for no limit."""
         self.latched = latched
+        self.publishers = 1
+        """Of the topic; see :attr:`kept`."""
         self.waiting: deque[int] = deque()
         """Serial numbers of its samples, oldest first."""
         self.size = 0
@@ -213,6 +224,8 @@ class _SubscriptionQueue:
         self.next_at = 0.0
         """When the throttle lets the next sample pass, seconds."""
         self.throttled: _Sample | None = None
+        self.middling = 0
+        """Number of its samples that are sent after small ones of other subscriptions."""
         self.large = 0
         """Number of its samples that are sent in turn with those of other subscriptions."""
         self.begun: _Sample | None = None
@@ -228,6 +241,11 @@ class _SubscriptionQueue:
         """Body that replaces each sample while it is inhibited; ``None`` to send nothing."""
         self.missed: deque[_Sample] = deque(maxlen=MAX_MISSED)
         """Latched samples that arrived while it was inhibited: their publishers may not send another."""
+
+    @property
+    def kept(self) -> int:
+        """Number of its newest samples that are kept beyond :data:`SUBSCRIPTION_BYTES`."""
+        return max(1, self.publishers) if self.latched else 1
 
 
 class SampleQueue:
@@ -254,6 +272,8 @@ class SampleQueue:
         self._queues: dict[int, _SubscriptionQueue] = {}
         self._small: OrderedDict[int, _Sample] = OrderedDict()
         """Samples sent in order of arrival, by serial number."""
+        self._middling: OrderedDict[int, _Sample] = OrderedDict()
+        """Samples sent after these. Small ones that must not overtake a middling one are here too."""
         self._large: OrderedDict[int, _Sample] = OrderedDict()
         """Samples sent in turns of subscriptions. Small ones that must not overtake a large one are here
         too."""
@@ -271,15 +291,19 @@ class SampleQueue:
         """No queued sample arrived before."""
         self._size = 0
 
-    def open(self, number: int, throttle: float = 0.0, latched: bool = False) -> None:
-        """Add a subscription, or change its throttle (seconds)."""
+    def open(self, number: int, throttle: float = 0.0, latched: bool = False, publishers: int = 1) -> None:
+        """Add a subscription, or change it.
+
+        :param throttle: seconds
+        :param publishers: how many the topic has
+        """
         queue = self._queues.get(number)
         if queue is None:
-            self._queues[number] = _SubscriptionQueue(throttle, latched)
-            return
+            queue = self._queues[number] = _SubscriptionQueue(throttle, latched)
         queue.next_at += throttle - queue.throttle
         queue.throttle = throttle
         queue.latched = latched
+        queue.publishers = publishers
 
     def close(self, number: int) -> None:
         """Remove a subscription and its samples; a begun sample is cancelled."""
@@ -311,11 +335,7 @@ class SampleQueue:
         if queue.inhibited:
             if queue.latched:
                 queue.missed.append(_Sample(number, now, stamp, body))
-                while (
-                    len(queue.missed) > 1
-                    and sum(len(each.body) for each in queue.missed) > SUBSCRIPTION_BYTES
-                ):
-                    queue.missed.popleft()
+                self._trim_missed(queue)
             if queue.held_value is None:
                 return False
             body = queue.held_value
@@ -366,7 +386,7 @@ class SampleQueue:
         if queue.large and queue.begun is None:
             self._turns.remove(number)
         queue.waiting.clear()
-        queue.size = queue.large = 0
+        queue.size = queue.middling = queue.large = 0
 
     def end_inhibition(self, number: int) -> bool:
         """End the inhibition of a subscription; returns whether a sample was queued by that."""
@@ -395,8 +415,8 @@ class SampleQueue:
                 self._enqueue_now(queue, queue.throttled, now)
 
     def next_frames(self, at_least: int, part: int = PART) -> list[bytes]:
-        """The next frames to write: small samples until there are ``at_least`` bytes, then one part of a
-        large sample. Empty if nothing is queued.
+        """The next frames to write: small samples until there are ``at_least`` bytes, then middling ones, at least
+        one, then one part of a large sample. Empty if nothing is queued.
 
         :param part: most bytes of the part
         """
@@ -407,19 +427,30 @@ class SampleQueue:
         out, self._cancellations = self._cancellations, []
         taken = 0
         while self._small and taken < at_least:
-            serial, sample = self._small.popitem(last=False)
-            queue, size = self._queues[sample.number], len(sample.body)
-            queue.waiting.remove(serial)
-            queue.size -= size
-            if not sample.repeated:
-                queue.last = sample.body
-            self._size -= size
-            frame = frames.encode_sample(sample.number, sample.stamp, sample.body)
+            frame = self._take_whole(self._small)
+            taken += len(frame)
+            out.append(frame)
+        first = True
+        while self._middling and (first or taken < at_least):
+            first = False
+            frame = self._take_whole(self._middling)
             taken += len(frame)
             out.append(frame)
         if self._turns:
             out += self._next_part(min(PART, max(LEAST_PART, part)))
         return out
+
+    def _take_whole(self, samples: OrderedDict[int, _Sample]) -> bytes:
+        """The frame of the first of these samples, which is removed."""
+        serial, sample = samples.popitem(last=False)
+        queue, size = self._queues[sample.number], len(sample.body)
+        queue.waiting.remove(serial)
+        queue.middling -= samples is self._middling
+        queue.size -= size
+        self._size -= size
+        if not sample.repeated:
+            queue.last = sample.body
+        return frames.encode_sample(sample.number, sample.stamp, sample.body)
 
     @property
     def waiting(self) -> int:
@@ -429,7 +460,7 @@ class SampleQueue:
     @property
     def ready(self) -> bool:
         """Whether :meth:`next_frames` returns frames once the transport has room."""
-        return bool(self._small or self._turns or self._cancellations)
+        return bool(self._small or self._middling or self._turns or self._cancellations)
 
     def trim(self) -> None:
         """Drop samples that exceed the bounds; to be called while the transport is full."""
@@ -445,7 +476,7 @@ class SampleQueue:
         self._append(queue, sample)
 
     def _append(self, queue: _SubscriptionQueue, sample: _Sample) -> None:
-        if sample.arrived < self._since or not (self._small or self._large):
+        if sample.arrived < self._since or not (self._small or self._middling or self._large):
             self._since = sample.arrived
         self._serial += 1
         if queue.large or queue.begun or len(sample.body) > LARGE:
@@ -453,6 +484,9 @@ class SampleQueue:
                 self._turns.append(sample.number)
             queue.large += 1
             self._large[self._serial] = sample
+        elif queue.middling or len(sample.body) > MIDDLING:
+            queue.middling += 1
+            self._middling[self._serial] = sample
         else:
             self._small[self._serial] = sample
         queue.waiting.append(self._serial)
@@ -474,7 +508,7 @@ class SampleQueue:
 
     def _begin_large_sample(self, queue: _SubscriptionQueue) -> bool:
         serial = queue.waiting[0]
-        if serial in self._small:
+        if serial not in self._large:
             return False  # it arrived earlier
         # The relay stores unfinished samples; it must accept them while together they fit into one frame.
         sample = self._large[serial]
@@ -517,17 +551,50 @@ class SampleQueue:
         return frame
 
     def _trim_queue(self, queue: _SubscriptionQueue) -> None:
-        while len(queue.waiting) > 1 and queue.size > SUBSCRIPTION_BYTES:
-            self._drop(queue.waiting[0])
+        if queue.size <= SUBSCRIPTION_BYTES:
+            return
+        for serial in self._replaceable(queue):
+            if queue.size <= SUBSCRIPTION_BYTES:
+                return
+            self._drop(serial)
+
+    def _replaceable(self, queue: _SubscriptionQueue) -> list[int]:
+        """Serial numbers of the waiting samples of a subscription that newer ones replace, oldest first."""
+        if not queue.latched:
+            return list(queue.waiting)[:-1]
+        return [serial for serial in queue.waiting if not self._sample(serial).repeated][: -queue.kept]
+
+    def _trim_missed(self, queue: _SubscriptionQueue) -> None:
+        size = sum(len(each.body) for each in queue.missed)
+        while len(queue.missed) > 1 and (
+            size > LATCHED_BYTES or (size > SUBSCRIPTION_BYTES and len(queue.missed) > queue.kept)
+        ):
+            dropped = queue.missed.popleft()
+            size -= len(dropped.body)
+            self._count_loss(dropped.number, SLOW_LINK, len(dropped.body))
 
     def _trim_all(self) -> None:
-        while self._size > MAX_BYTES and len(self._small) + len(self._large) > 1:
-            self._drop(min(next(iter(samples)) for samples in (self._small, self._large) if samples))
+        if self._size > MAX_BYTES:
+            kept = self._kept()
+            size = sum(len(self._sample(serial).body) for serial in kept)
+            others = sorted({*self._small, *self._middling, *self._large} - kept)
+            while self._size - size > MAX_BYTES and len(others) > 1:
+                self._drop(others.pop(0))
+            for serial in sorted(kept)[:-1]:
+                if size <= LATCHED_BYTES:
+                    break
+                size -= len(self._sample(serial).body)
+                self._drop(serial)
         self._trim_old()
+
+    def _kept(self) -> set[int]:
+        """Serial numbers of latched samples that newer ones do not replace."""
+        latched = (queue for queue in self._queues.values() if queue.latched and queue.waiting)
+        return {serial for queue in latched for serial in set(queue.waiting) - set(self._replaceable(queue))}
 
     def _trim_old(self) -> None:
         oldest = self._now() - MAX_AGE
-        for samples in (self._small, self._large):
+        for samples in (self._small, self._middling, self._large):
             old = []
             for serial, sample in samples.items():
                 if sample.arrived >= oldest:
@@ -560,14 +627,23 @@ class SampleQueue:
         loss.size = max(loss.size, size)
 
     def _remove(self, serial: int) -> _Sample:
-        large = serial in self._large
+        middling, large = serial in self._middling, serial in self._large
         sample = self._pop(serial)
         queue = self._queues[sample.number]
         queue.waiting.remove(serial)
+        queue.middling -= middling
         queue.large -= large
         queue.size -= len(sample.body)
         self._size -= len(sample.body)
         return sample
 
+    def _group(self, serial: int) -> OrderedDict[int, _Sample]:
+        if serial in self._small:
+            return self._small
+        return self._middling if serial in self._middling else self._large
+
+    def _sample(self, serial: int) -> _Sample:
+        return self._group(serial)[serial]
+
     def _pop(self, serial: int) -> _Sample:
-        return self._small.pop(serial) if serial in self._small else self._large.pop(serial)
+        return self._group(serial).pop(serial)

@@ -156,6 +156,10 @@ class Link(ABC):
         """Encoded messages that :meth:`take` returns next."""
         self._last_received = clock()
 
+    def discard(self) -> None:
+        """The connection is lost: drop what has come of incomplete frames and messages."""
+        self._frames.clear()
+
     @abstractmethod
     def begin(self) -> None:
         """The connection is made; send the first message."""

@@ -126,6 +126,7 @@ class LinkProtocol(TwistedProtocol):
                 timer.cancel()
         lost = self._reason or self._link_error(reason)
         self._reason = lost
+        self.link.discard()
         self.owner.on_lost(lost)
 
     def flush(self) -> None:

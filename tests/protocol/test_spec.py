@@ -212,6 +212,17 @@ def test_the_version_and_the_words_of_rights_are_the_codes() -> None:
             f"{limits.FRAGMENT_SECONDS:g} s",
             10,
         ),
+        (
+            f"over all connections | {limits.UNFINISHED_MESSAGES} times the largest message "
+            f"({limits.UNFINISHED_MESSAGES * limits.CLIENT_MESSAGE // 10**6} MB)",
+            40,
+        ),
+        (
+            f"finish a message | {limits.MESSAGE_SECONDS:g} s, and 1 s for each "
+            f"{limits.MESSAGE_RATE // limits.KIB} KiB",
+            16,
+        ),
+        (f"two parts of a sample | {limits.PART_SECONDS:g} s", 60),
         (f"JSON message to a robot | {limits.RELAY_JSON_FRAME // limits.MIB} MiB", 4),
         (f"sample or command to a robot | {limits.RELAY_FRAME // limits.MIB} MiB", 16),
         (f"stride of a point cloud | {limits.STRIDE}", 1000),

@@ -13,7 +13,7 @@ import msgspec
 from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
-from relay_protocol import link
+from relay_protocol import limits, link
 from relay_protocol.errors import Unavailable
 from relay_protocol.link.motion import ControlOrder
 from relay_protocol.rights import Grant, Level, Rules
@@ -22,6 +22,7 @@ from relay_server.channels.channel import Channel, Channels
 from relay_server.cluster.homes import SingleHome
 from relay_server.common.clock import PeriodicTimers
 from relay_server.common.cpu_quota import UserQuotas
+from relay_server.common.unfinished import UnfinishedBytes
 from relay_server.control.controllers import Controllers
 from relay_server.control.service import ControlService
 from relay_server.control.types import ControlRules
@@ -194,6 +195,7 @@ class MemoryClient:
         self.sent: list[bytes] = []
         self.pings: list[bytes] = []
         self.closed: tuple[int, str] | None = None
+        self.unfinished = UnfinishedBytes(limits.UNFINISHED_MESSAGES * limits.CLIENT_MESSAGE).count(1)
 
     def send(self, frames: bytes) -> None:
         """Stores the frames' content; a closed websocket stores nothing."""

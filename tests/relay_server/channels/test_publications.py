@@ -538,6 +538,60 @@ def test_a_command_is_not_held_longer_than_it_is_good(world: World) -> None:
     assert "in time" in person.reported()[0]
 
 
+NOT_FINITE = {
+    '{"linear":{"x":NaN}}': "linear.x must be finite in a command that moves the robot, not NaN",
+    '{"angular":{"z":-Infinity}}': "angular.z must be finite in a command that moves the robot, not -Infinity",
+    '{"linear":{"x":null}}': "linear.x must be finite in a command that moves the robot, not null",
+    '{"linear":{"x":0.1,"y":"\\u0000\\u004eaN"}}': "linear.y must be finite in a command that moves the robot, not NaN",
+}
+
+
+@pytest.mark.parametrize("msg", NOT_FINITE)
+@pytest.mark.parametrize("robot", ["cdr", "json", "json without types"])
+def test_a_command_has_only_finite_numbers(world: World, robot: str, msg: str) -> None:
+    """For every kind of robot; one that speaks JSON would get ``null``, which its code may read as 0."""
+    world.robot_comes(encodings=["cdr", "json"] if robot == "cdr" else ["json"])
+    person = world.person()
+    person.says("set_level", level="error")
+    world.robot_joins(tells_types=robot == "json")
+    person.says("advertise", topic="/cmd_vel", type=TWIST)
+    (asked,) = world.link.all(link.Advertise)
+    world.define()
+    world.channel.message(
+        link.Advertised(
+            number=asked.number, topic="/cmd_vel", type=TWIST, encoding=robot.split()[0], motion=True
+        )
+    )
+    person.answers_pings()
+    person.rosbridge.message(f'{{"op":"publish","topic":"/cmd_vel","msg":{msg}}}'.encode())
+    assert person.reported() == [f"publish /cmd_vel: {NOT_FINITE[msg]}"]
+    assert not world.link.commands
+    person.rosbridge.message(b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":0.25}}}')
+    assert person.reported() == []
+    assert len(world.link.commands) == 1
+
+
+def test_commands_of_an_unknown_type_are_finite_too(world: World) -> None:
+    """Also where only the robot's answer says that the topic moves it; text is no number."""
+    world.robot_comes(encodings=["json"])
+    world.robot.description = link.Describe()
+    person = world.person()
+    person.says("set_level", level="error")
+    world.robot_joins()
+    person.says("advertise", topic="/own", type="a/Own")
+    (asked,) = world.link.all(link.Advertise)
+    world.channel.message(
+        link.Advertised(number=asked.number, topic="/own", type="a/Own", encoding="json", motion=True)
+    )
+    person.says("publish", topic="/own", msg={"speeds": [{"at": 1}, {"at": None}]})
+    assert person.reported() == [
+        "publish /own: speeds[1].at must be finite in a command that moves the robot, not null"
+    ]
+    assert not world.link.commands
+    person.says("publish", topic="/own", msg={"frame": "null"})
+    assert [body for *_, body in world.link.commands] == [b'{"frame": "null"}']
+
+
 def test_memory_per_client_is_bounded(world: World) -> None:
     """For any number of topics; further messages are dropped and reported."""
     person = world.at_work()

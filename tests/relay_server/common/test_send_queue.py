@@ -368,7 +368,7 @@ def test_lasting_samples_do_not_become_stale() -> None:
     receiver = paused()
     for n in range(6):
         receiver.outbox.send_droppable("stream", b"s%d" % n)
-        receiver.outbox.send_droppable("map", b"m%d" % n, lasting=True)
+        receiver.outbox.send_droppable("map", b"m%d" % n, lasting=2)
     receiver.now = 5.0
     receiver.outbox.set_limits(1000, 10_000.0)
     got = receiver.resume()
@@ -379,11 +379,28 @@ def test_lasting_samples_do_not_become_stale() -> None:
 def test_lasting_samples_are_evicted_after_others() -> None:
     receiver = paused()
     for _ in range(3):
-        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=True)
+        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=2)
     for n in range(4):
         receiver.outbox.send_droppable("stream", bytes([n]) * (MIB // 4))
     assert [len(each) for each in receiver.resume()].count(MIB // 2) == 3
     receiver.outbox.pause()
     for _ in range(20):
-        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=True)
+        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=2)
     assert receiver.outbox.waiting_bytes <= 2 * MIB
+
+
+def test_a_sample_of_each_publisher_of_a_latched_topic_arrives() -> None:
+    """However many bytes they have together, within a bound, and whatever depth the client requests."""
+    receiver = paused()
+    receiver.outbox.send_droppable("stream", b"s")
+    for n in range(12):
+        receiver.outbox.send_droppable("map", bytes([n]) * 500_000, 1, lasting=10)
+    for n in range(5):
+        receiver.outbox.send_droppable("stream", bytes([n]) * (MIB // 2))
+    got = receiver.resume()
+    assert [each[0] for each in got if len(each) == 500_000] == list(range(2, 12))
+    assert [each[0] for each in got if len(each) == MIB // 2] == [1, 2, 3, 4]
+    receiver.outbox.pause()
+    for n in range(20):
+        receiver.outbox.send_droppable("map", bytes([n]) * MIB, lasting=20)
+    assert [each[0] for each in receiver.resume()] == list(range(4, 20))

@@ -444,18 +444,39 @@ def test_a_clock_that_begins_again_many_times_is_followed(world: FoxgloveWorld) 
 
 @pytest.mark.parametrize("literal", ["NaN", "-Infinity"])
 def test_nan_in_json_is_published_as_a_number(world: FoxgloveWorld, literal: str) -> None:
-    """Python writes it. The robot refuses it where it would move."""
+    """Python writes it. It is legal where it moves nothing."""
+    world.registry.described(world.robot, link.Describe())
     client = world.client()
     world.settle(client)
     channel = {"id": 1, "topic": "/cmd_vel", "encoding": "json", "schemaName": "geometry_msgs/Twist"}
     client.sends("advertise", channels=[channel])
     (asked,) = world.link.take(link.Advertise)
+    world.channel.message(link.Advertised(number=asked.number, topic=asked.topic, type=TWIST, encoding="cdr"))
+    client.publishes(1, f'{{"linear":{{"x":{literal}}}}}'.encode())
+    world.clock.advance(0)
+    assert world.link.samples[-1][2] == twist(float(literal))
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "json"])
+@pytest.mark.parametrize("literal", ["NaN", "-Infinity"])
+def test_nan_in_a_command_is_refused_in_words(world: FoxgloveWorld, encoding: str, literal: str) -> None:
+    """CDR can hold it as well."""
+    client = world.client()
+    world.settle(client)
+    channel = {"id": 1, "topic": "/cmd_vel", "encoding": encoding, "schemaName": "geometry_msgs/Twist"}
+    client.sends("advertise", channels=[channel])
+    (asked,) = world.link.take(link.Advertise)
     world.channel.message(
         link.Advertised(number=asked.number, topic=asked.topic, type=TWIST, encoding="cdr", motion=True)
     )
-    client.publishes(1, f'{{"linear":{{"x":{literal}}}}}'.encode())
+    payload = twist(float(literal)) if encoding == "cdr" else f'{{"linear":{{"x":{literal}}}}}'.encode()
+    client.publishes(1, payload)
     world.clock.advance(0)
-    assert world.link.commands[-1][3] == twist(float(literal))
+    assert not world.link.commands
+    assert any(
+        "publish /cmd_vel: linear.x must be finite in a command that moves the robot" in each["message"]
+        for each in client.took("status")
+    )
 
 
 def test_json_of_the_publish_panel_may_leave_fields_out(world: FoxgloveWorld) -> None:

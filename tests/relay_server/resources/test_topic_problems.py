@@ -20,7 +20,7 @@ from relay_server.resources.service import RobotResourceService
 from relay_server.resources.topics_http import TopicEndpoints
 from tests.worlds.http_client import HOST, Transport, parse
 from tests.worlds.http_client import World as Site
-from tests.worlds.relay import STRING, World, text
+from tests.worlds.relay import STRING, TWIST, World, text
 from tests.worlds.robot_channel_link import RobotLink
 
 TOPICS = "/api/v1/robots/rover/topics"
@@ -70,16 +70,31 @@ def stream(site: Site, topic: str) -> Transport:
     return transport
 
 
-def publish(site: Site) -> Transport:
+def publish(site: Site, topic: str = "chatter", value: bytes = b'{"data":"by http"}') -> Transport:
     """Requests that a message is published."""
     transport = site.connect()
-    body = b'{"value":{"data":"by http"}}'
+    body = b'{"value":' + value + b"}"
     head = (
-        f"PUT {TOPICS}/chatter HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\nConnection: close\r\n"
+        f"PUT {TOPICS}/{topic} HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\nConnection: close\r\n"
     )
     head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
     site.send(transport, head.encode() + body)
     return transport
+
+
+@pytest.mark.parametrize("number", [b"NaN", b"null"])
+def test_a_command_that_is_not_finite_is_refused_in_words(
+    site: Site, robot: RobotLink, number: bytes
+) -> None:
+    robot.world.robot.description = link.Describe()
+    answer = publish(site, "cmd_vel", b'{"linear":{"x":' + number + b"}}")
+    robot.joins().advertised("/cmd_vel", TWIST, motion=True)
+    for _ in range(50):
+        robot.world.clock.advance(0.1)
+        site.clock.advance(0.1)
+    told = parse(answer.value())
+    assert told.status == 400
+    assert b"linear.x must be finite" in told.body
 
 
 def statuses(transport: Transport) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -10,12 +11,12 @@ from twisted.logger import capturedLogs
 
 from relay_db import queries
 from relay_protocol import identity, limits, link
-from relay_protocol.frames import encode_json, encode_sample, encode_video
+from relay_protocol.frames import JSON_NUMBER, encode_json, encode_part, encode_sample, encode_video
 from relay_server.auth import login_limiter
 from relay_server.robots.connection import PINGS, REPLACED_SECONDS
 from relay_server.robots.link_handlers import FLAPPING_SECONDS, LOGGED_ALERTS_AT_ONCE, LONGEST_REPLACE_SECONDS
 from relay_server.robots.registry import REPLACE_SECONDS
-from tests.worlds.robot_links import FINGERPRINT, KEY, RobotLinkWorld
+from tests.worlds.robot_links import FINGERPRINT, KEY, Robot, RobotLinkWorld
 
 # --- registration -----------------------------------------------------------------------------------------
 
@@ -232,6 +233,55 @@ async def test_a_robot_that_leaves_while_the_database_is_asked_leaves_no_ghost(s
     assert not scene.online
     assert not [call for call in scene.world.clock.getDelayedCalls() if call.active()]
     assert (await scene.dial().registers())["op"] == "welcome"
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_an_ended_link_sent_is_gone_with_it(scene: RobotLinkWorld) -> None:
+    """A part of a frame, and parts of a sample, even while something still refers to the connection."""
+    robot = await scene.registered()
+    tracemalloc.start()
+    try:
+        robot.sends(encode_part(7, 1, limits.MIB // 2, 0, bytes(limits.MIB // 4)))
+        robot.sends(encode_json(bytes(limits.MIB // 4))[:-1])
+        assert tracemalloc.get_traced_memory()[0] >= limits.MIB // 2
+        robot.breaks()
+        assert tracemalloc.get_traced_memory()[0] < limits.MIB // 8
+    finally:
+        tracemalloc.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_sample_whose_parts_stop_is_dropped_and_the_link_stays(scene: RobotLinkWorld) -> None:
+    """60 s after its last part. Further parts of it are passed over until a sample begins."""
+    robot = await scene.registered()
+    decoder = robot.connection._decoder
+    robot.sends(encode_part(7, 1, 100, 0, b"x") + encode_part(8, 1, 100, 0, b"x"))
+    await passes(scene, robot, 50)
+    robot.sends(encode_part(8, 1, 100, 1, b"x"))
+    await passes(scene, robot, 20)
+    assert decoder.buffered == 2
+    robot.sends(encode_part(7, 1, 100, 1, b"x") + encode_part(8, 1, 100, 2, b"x"))
+    assert decoder.buffered == 3
+    robot.sends(encode_part(7, 2, 100, 0, b"x") + encode_part(7, 2, 100, 1, b"x"))
+    assert decoder.buffered == 5
+    assert robot.transport.connected
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_message_whose_parts_stop_ends_the_link(scene: RobotLinkWorld) -> None:
+    """It must not be lost without notice."""
+    robot = await scene.registered()
+    robot.sends(encode_part(JSON_NUMBER, 0, 100, 0, b"x"))
+    await passes(scene, robot, 70)
+    assert not robot.transport.connected
+
+
+async def passes(scene: RobotLinkWorld, robot: Robot, seconds: int) -> None:
+    """Time passes while the robot is alive."""
+    for _ in range(seconds):
+        scene.world.clock.advance(1)
+        if robot.transport.connected:
+            robot.says(link.Ping(t=1))
 
 
 def test_connections_of_one_address_are_capped(scene: RobotLinkWorld) -> None:

@@ -149,6 +149,35 @@ def test_a_message_that_does_not_go_on_is_given_up(person: Person, world: World)
     assert unfinished(person) == (0, 0, 0)
 
 
+def test_a_message_that_comes_too_slowly_is_given_up(person: Person, world: World) -> None:
+    """30 s after its first fragment, though fragments still come; later ones of it are passed over."""
+    person.says("fragment", id="slow", num=0, total=100, data="x")
+    for number in range(1, 6):
+        world.clock.advance(5)
+        person.answers_pings()
+        person.says("fragment", id="slow", num=number, total=100, data="x")
+    assert not person.reported()
+    world.clock.advance(6)
+    person.answers_pings()
+    assert person.reported() == ["a message in fragments is dropped: 6 of 100 came in 31 s"]
+    assert unfinished(person) == (0, 0, 0)
+
+
+def test_fragments_count_against_the_user(person: Person) -> None:
+    """Over all connections, with what they take beside their bytes; an ended connection gives all back."""
+    user_bytes = person.client.unfinished
+    assert user_bytes.take(4 * limits.CLIENT_MESSAGE - 500)
+    for number in range(4):
+        person.says("fragment", id=number, num=0, total=2, data="x" * 100)
+    assert person.reported() == [
+        "unfinished messages of one user have at most 40000000 bytes, over all connections"
+    ]
+    assert unfinished(person) == (3, 3, 300)
+    person.says("fragment", id=0, num=1, total=2, data="x")
+    person.session.end()
+    assert user_bytes.held == 4 * limits.CLIENT_MESSAGE - 500
+
+
 def test_disconnected_client_leaves_no_state(person: Person, world: World) -> None:
     """Neither memory nor a timer."""
     send(person, "m", "x", "y", order=[0])

@@ -63,6 +63,34 @@ def scene(world: World) -> Scene:
     return Scene(world)
 
 
+@pytest.mark.parametrize("number", ["NaN", "null"])
+@pytest.mark.parametrize("moves", [True, False])
+@pytest.mark.parametrize("how", ["call", "goal"])
+def test_a_request_that_moves_the_robot_has_only_finite_numbers(
+    scene: Scene, how: str, moves: bool, number: str
+) -> None:
+    """Others may have NaN; a robot that speaks JSON gets ``null`` then."""
+    person = scene.person()
+    args = f'{{"to":{{"x":[1,{number}]}}}}'
+    if how == "goal":
+        action = "/dock" if moves else "/count"
+        text = (
+            f'"op":"send_action_goal","id":"a","action":"{action}","action_type":"a/action/Own","args":{args}'
+        )
+    else:
+        service = "/reset" if moves else "/lamp"
+        text = f'"op":"call_service","id":"a","service":"{service}","type":"a/srv/Own","args":{args}'
+    person.rosbridge.message(f"{{{text}}}".encode())
+    scene.world.clock.advance(0.1)
+    reported = person.reported()
+    assert len(scene.asked()) == (not moves)
+    assert reported == (
+        [f"to.x[1] must be finite in a command that moves the robot, not {number}"] if moves else []
+    )
+    if moves:
+        assert not scene.world.controllers.of(scene.world.robot).lease.held_by(person.context)
+
+
 def ask(person: Person, how: str, moves: bool = True) -> None:
     """The client sends a request."""
     action, service = ("/dock", "/reset") if moves else ("/count", "/lamp")

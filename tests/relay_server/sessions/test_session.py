@@ -302,6 +302,22 @@ def test_a_slow_client_loses_samples_and_no_other_does(world: World) -> None:
     assert (slow.rosbridge.send_queue.dropped, quick.rosbridge.send_queue.dropped) == (3, 0)
 
 
+def test_a_client_gets_a_latched_sample_of_each_publisher(world: World) -> None:
+    """However slowly it reads, and whatever depth it requests, as no publisher sends another."""
+    person = world.at_work()
+    person.says("subscribe", topic="/chatter", queue_length=1)
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number, latched=True, publishers=10)
+    world.define()
+    person.rosbridge.pause()
+    for each in range(10):
+        world.channel.sample(number, text(str(each) * 500_000), each + 1)
+        world.clock.advance(0.2)
+    person.rosbridge.resume()
+    assert [message["msg"]["data"][0] for message in person.received("publish")] == list("0123456789")
+    assert person.rosbridge.send_queue.dropped == 0
+
+
 def test_queued_samples_of_an_unsubscribed_topic_are_dropped(world: World) -> None:
     person = world.person()
     world.working()

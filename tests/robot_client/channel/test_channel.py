@@ -383,6 +383,23 @@ def test_repeated_latched_samples_pass_throttle_and_full_transport(world: Channe
     assert {each.body for each in world.frames()} == {b"aaaa", b"bbbb", b"cccc"}
 
 
+def test_latched_samples_of_all_publishers_pass_a_full_transport(world: ChannelWorld) -> None:
+    """Each publisher has sent one, and none is sent again."""
+    source = latched(world)
+    source.publishers = 10
+    source.on_change()
+    world.clock.advance(0)
+    world.channel.pause()
+    for number in range(10):
+        source.stamp = 20 + number
+        world.platform.emit("/chat", bytes([number]) * 500_000)
+        world.clock.advance(0.3)
+    world.channel.resume()
+    world.run(2)
+    assert [each.body[0] for each in world.frames()[3:]] == list(range(10))
+    assert not [each for each in world.writer.sent if isinstance(each, link.SamplesDropped)]
+
+
 def test_inhibited_topics_repeat_no_new_samples(world: ChannelWorld) -> None:
     """The end is sent in any case."""
     source = latched(world)

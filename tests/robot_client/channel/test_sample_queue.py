@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from twisted.internet.task import Clock
 
 from relay_protocol.frames import PART, SAMPLE, FrameDecoder, SampleFrame
-from relay_protocol.limits import ROBOT_FRAME
+from relay_protocol.limits import MIB, ROBOT_FRAME
 from robot_client.channel.sample_queue import (
     LARGE,
     MAX_BYTES,
@@ -353,6 +353,117 @@ def test_held_subscription_repeats_the_last_sample_sent() -> None:
     queue.inhibit(1, hold=True)
     assert queue.enqueue(1, 7, b"d")
     assert FrameDecoder(2**25).feed(b"".join(queue.next_frames(1))) == [SampleFrame(1, 7, b"b")]
+
+
+def test_small_samples_pass_middling_ones_of_other_subscriptions() -> None:
+    """A pose does not wait for ten pictures of 10 kB that a slow link has not taken yet. Each chunk has one of them."""
+    queue = sample_queue(Clock())
+    for number in range(2, 12):
+        queue.open(number)
+        queue.enqueue(number, 0, bytes(10_000))
+    chunks = []
+    for _ in range(3):
+        queue.enqueue(1, 0, b"pose")
+        queue.enqueue(2, 0, b"small, but of a topic with pictures that wait")
+        chunks.append(kinds(queue.next_frames(4)))
+    assert chunks == [[(SAMPLE, 1), (SAMPLE, number)] for number in (2, 3, 4)]
+    order = [sample.number for sample in samples(queue)]
+    assert order == [5, 6, 7, 8, 9, 10, 11, 2, 2, 2]
+
+
+def test_middling_samples_are_dropped_as_others() -> None:
+    """By age and bytes, and with their subscription."""
+    clock = Clock()
+    queue = sample_queue(clock)
+    queue.open(2)
+    queue.paused = True
+    for number in range(40):
+        queue.enqueue(1, number, bytes([number]) * 10_000)
+    assert queue.waiting <= SUBSCRIPTION_BYTES
+    queue.enqueue(2, 0, b"small")
+    clock.advance(1.1)
+    queue.enqueue(1, 0, bytes([50]) * 10_000)
+    queue.enqueue(2, 0, bytes(10_000))
+    queue.trim()
+    queue.close(2)
+    queue.paused = False
+    assert [body[0] for body in bodies(queue)] == [50]
+    assert queue.waiting == 0
+    queue.enqueue(1, 0, b"small again")
+    assert bodies(queue) == [b"small again"]
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 3), st.sampled_from([10, 3_000, 20_000])), max_size=30),
+    st.integers(1, 40_000),
+)
+def test_each_subscription_keeps_its_order(sent: list[tuple[int, int]], room: int) -> None:
+    """Small, middling and large samples overtake only those of other subscriptions."""
+    queue = SampleQueue(Clock().seconds)
+    decoder, got = FrameDecoder(ROBOT_FRAME), list[tuple[int, int]]()
+    for number in (1, 2, 3):
+        queue.open(number)
+    for stamp, (number, size) in enumerate(sent):
+        queue.enqueue(number, stamp, bytes(size))
+        if stamp % 3 == 0:
+            for frame in decoder.feed(b"".join(queue.next_frames(room))):
+                assert isinstance(frame, SampleFrame)
+                got.append((frame.number, frame.stamp))
+    while chunk := queue.next_frames(room):
+        for frame in decoder.feed(b"".join(chunk)):
+            assert isinstance(frame, SampleFrame)
+            got.append((frame.number, frame.stamp))
+    for number in (1, 2, 3):
+        assert [stamp for each, stamp in got if each == number] == [
+            stamp for stamp, (each, _) in enumerate(sent) if each == number
+        ]
+    assert not queue.ready
+    assert queue.waiting == 0
+
+
+def test_a_latched_sample_of_each_publisher_survives_a_full_transport() -> None:
+    """However large they are together, within a bound; more than the topic has publishers are replaced as others."""
+    queue = sample_queue(Clock())
+    queue.open(1, latched=True, publishers=10)
+    queue.open(2)
+    queue.paused = True
+    for number in range(12):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+        queue.enqueue(2, number, bytes([100 + number]) * 200_000)
+    queue.trim()
+    queue.paused = False
+    got = [body[0] for body in bodies(queue)]
+    assert [each for each in got if each < 100] == list(range(2, 12))
+    assert [each for each in got if each >= 100] == [111]
+    queue.paused = True
+    for number in range(10):
+        queue.enqueue(1, number, bytes([number]) * 2 * MIB)
+    queue.paused = False
+    assert [body[0] for body in bodies(queue)] == list(range(2, 10))
+
+
+def test_repeated_samples_survive_a_full_transport_too() -> None:
+    """They are of several publishers, and newer samples do not replace them."""
+    queue = sample_queue(Clock())
+    queue.open(1, latched=True, publishers=2)
+    queue.paused = True
+    for number in range(1, 5):
+        queue.enqueue_latched(1, number, bytes([number]) * 500_000)
+    queue.enqueue_latched(1, 0, b"")
+    for number in range(5, 9):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+    queue.paused = False
+    assert [body[:1] for body in bodies(queue)] == [b"\1", b"\2", b"\3", b"\4", b"", b"\7", b"\x08"]
+
+
+def test_an_inhibition_keeps_a_latched_sample_of_each_publisher() -> None:
+    queue = sample_queue(Clock())
+    queue.open(1, latched=True, publishers=10)
+    queue.inhibit(1, hold=False)
+    for number in range(11):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+    queue.end_inhibition(1)
+    assert [body[0] for body in bodies(queue)] == list(range(1, 11))
 
 
 def test_latched_samples_that_arrived_during_an_inhibition_are_sent_afterwards() -> None:
