@@ -413,7 +413,8 @@ def _layout(axes: tuple[int, int] | None, buttons: tuple[int, int, int] | None) 
         return None
     if axes is None or buttons is None:
         raise click.UsageError("--axes and --buttons describe a gamepad together: give both")
-    return ButtonLayout(*axes, *buttons)
+    (ahead, left), (hold, stop, back) = axes, buttons
+    return ButtonLayout(ahead, left, hold, stop, back)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
