@@ -8,7 +8,7 @@ export PYTHONDONTWRITEBYTECODE :=
 NPM := scripts/with-node.sh npm --silent --prefix web_client
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test conformance robot-conformance bench stills screenshots docs reference house lint types api-types web wheel release clean
+.PHONY: help setup demo test quick conformance robot-conformance bench stills screenshots docs reference house lint types api-types web wheel release clean
 
 help: ## list these commands
 	@echo 'make <command>:'
@@ -24,6 +24,9 @@ demo: ## run a relay with two simulated robots and print how to log in (options:
 test: setup ## all tests: Python, ROS 2, browser, portal (options: PYTEST='-k drive')
 	$(BIN)/python scripts/run_tests.py -n 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
 	$(NPM) run test
+
+quick: setup ## the tests that need no ROS, browser or process, in two minutes (options: PYTEST='-k drive')
+	$(BIN)/python -m pytest -n 2 --dist loadfile --quick $(PYTEST)
 
 CASES := $(BIN)/python -m pytest -q --no-header -r N --tb=short --table
 LISTEN ?= 0.0.0.0:9091

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -26,11 +28,7 @@ settings.register_profile("same", _UNTIMED, derandomize=True, database=None)
 settings.load_profile("same")
 
 SECONDS = Path(__file__).with_name("seconds.txt")
-"""Seconds, processor seconds and path of each slow file, the slowest first."""
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--note-seconds", action="store_true", help="write tests/seconds.txt from this run")
+"""Seconds, processor seconds and path of each slow file, the slowest first: a copy of ``build/seconds.txt``."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -38,14 +36,42 @@ def pytest_configure(config: pytest.Config) -> None:
     processor = ProcessorSeconds(config)
     config.pluginmanager.register(processor)
     if not hasattr(config, "workerinput"):
-        noted = SECONDS if config.getoption("--note-seconds", False) else None
-        config.pluginmanager.register(Durations(processor, noted))
+        config.pluginmanager.register(Durations(processor))
+
+
+QUICK_FOLDERS = ("db", "protocol", "relay_server", "robot_client")
+QUICK_SECONDS = 2.0
+"""Most seconds of a file that ``make quick`` runs."""
+
+REAL_PARTS = re.compile(
+    r"\brclpy\b|\bsubprocess\b|worlds\.\w*(process|ros_|browser|postgresql|mosquitto|nats|dask)"
+)
+"""Test files with these use ROS, a browser or processes."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--quick", action="store_true", help="only files that need no ROS, browser or process")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With ``--quick``, leave out slow files and those with real parts."""
+    if not config.getoption("--quick") or not collection_path.is_file():
+        return None
+    path = collection_path.relative_to(config.rootpath)
+    if path.parts[1] not in QUICK_FOLDERS or _noted().get(path.as_posix(), 0.0) > QUICK_SECONDS:
+        return True
+    return True if REAL_PARTS.search(collection_path.read_text()) else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    lines = [line.split() for line in SECONDS.read_text().splitlines()]
-    noted = {path: float(seconds) for seconds, _, path in lines}
+    noted = _noted()
     items.sort(key=lambda item: -noted.get(file_of(item.nodeid), 0.0))
+
+
+@cache
+def _noted() -> dict[str, float]:
+    lines = [line.split() for line in SECONDS.read_text().splitlines()]
+    return {path: float(seconds) for seconds, _, path in lines}
 
 
 def pytest_collection_finish() -> None:

@@ -9,8 +9,11 @@ from typing import Any
 import psutil
 import pytest
 
-NOTED = 5.0
-"""Files that take at least so many seconds are written to ``tests/seconds.txt``."""
+NOTED = 1.0
+"""Files that take at least so many seconds are written to :data:`WRITTEN`."""
+
+WRITTEN = Path("build/seconds.txt")
+"""Seconds, processor seconds and path of each slow file, the slowest first."""
 
 SHOWN = 10
 
@@ -65,13 +68,11 @@ class Durations:
     """Runs in the process that prints: sums up files over all workers, and prints the slowest.
 
     :param own: processor seconds of tests that run in this process
-    :param noted: the file that gets the seconds of all slow files, if any
     """
 
-    def __init__(self, own: ProcessorSeconds, noted: Path | None) -> None:
+    def __init__(self, own: ProcessorSeconds) -> None:
         self._seconds: Counter[str] = Counter()
         self._processor: Counter[str] = own.by_file
-        self._noted = noted
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Called for each phase of each test."""
@@ -93,11 +94,11 @@ class Durations:
             terminalreporter.write_line(
                 f"{seconds:5.0f} s  {self._processor[path]:5.0f} s of processor  {path}"
             )
-        if self._noted is not None:
-            self._noted.write_text(
-                "".join(
-                    f"{seconds:.0f} {self._processor[path]:.0f} {path}\n"
-                    for path, seconds in self._seconds.most_common()
-                    if seconds >= NOTED
-                )
+        WRITTEN.parent.mkdir(exist_ok=True)
+        WRITTEN.write_text(
+            "".join(
+                f"{seconds:.0f} {self._processor[path]:.0f} {path}\n"
+                for path, seconds in self._seconds.most_common()
+                if seconds >= NOTED
             )
+        )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import faulthandler
 import multiprocessing
 import os
 import runpy
@@ -32,6 +33,9 @@ PROGRAMS = {
     "switchboard-sim": "robot_client.sim.main",
 }
 """Our commands, and the module each has its ``main`` in."""
+
+STACKS_SIGNAL = signal.SIGUSR2
+"""Writes the stacks of all threads to the error output."""
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_NAME = 15
@@ -155,6 +159,7 @@ def _be(command: list[str], env: dict[str, str], streams: tuple[str, str, str]) 
         os.dup2(opened, descriptor)
         os.close(opened)
     _new_reactor()
+    faulthandler.register(STACKS_SIGNAL, file=2, all_threads=True)
     sys.argv = command
     with contextlib.ExitStack() as opened_streams:
         sys.stdin = opened_streams.enter_context(open(0, encoding="utf-8", closefd=False))

@@ -8,11 +8,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tests.worlds.forked_programs import Forked, forkable, start
+from tests.worlds.forked_programs import STACKS_SIGNAL, Forked, forkable, start
 from tests.worlds.waiting import PATIENCE, freeze, wait_for
 
 BIN = Path(sys.executable).parent
@@ -80,6 +81,19 @@ class Process:
             return next((each for each in self.said().splitlines() if each.startswith(start)), None)
 
         return str(wait_for(f"{self.name} prints {start}", line, START_SECONDS))
+
+    def explanation(self) -> str:
+        """What it is doing, for a test that fails: its end or its stacks, and the last part of its log."""
+        if isinstance(self.popen, Forked) and self.popen.poll() is None:
+            before = self.log.stat().st_size
+            self.popen.send_signal(STACKS_SIGNAL)
+            with contextlib.suppress(AssertionError):
+                wait_for("its stacks are written", lambda: self.log.stat().st_size > before, 2.0)
+                time.sleep(0.2)  # the rest of them
+        code = self.popen.poll()
+        return (
+            f"{self.name} {'runs' if code is None else f'ended with {code}'}: {self.log.read_text()[-6000:]}"
+        )
 
     def signal(self, number: int) -> None:
         """Send a signal."""

@@ -81,7 +81,10 @@ class Robot:
 
     def wait_online(self, seconds: float = PATIENCE) -> None:
         """Waits until the relay sees it."""
-        wait_for(f"{self.name} is online", lambda: self.relay.state_of(self.name) != "offline", seconds)
+        try:
+            wait_for(f"{self.name} is online", lambda: self.relay.state_of(self.name) != "offline", seconds)
+        except AssertionError as error:
+            raise AssertionError(f"{error}\n{self.daemon.explanation()}") from None
 
     def record(self) -> list[dict[str, Any]]:
         """Commands and motion of the simulated body: dicts with ``t`` (monotonic ns) and ``event``."""
