@@ -39,9 +39,9 @@ robot-conformance: ## check a robot that dials LISTEN=0.0.0.0:9091 (docs/referen
 	@scripts/setup.sh python
 	@$(CASES) tests/conformance/robot_link --listen='$(LISTEN)'
 
-bench: ## measure beside alternatives, all of it in two hours (options: BENCH='hop fanout', BENCH='--quick', BENCH='modules --strict')
+bench: ## measure beside alternatives, all of it in two hours (options: BENCH='hop fanout', BENCH='--quick', BENCH='modules --strict', BASE=<commit>)
 	@scripts/setup.sh python web interfaces browser bench
-	$(BIN)/python -m bench $(BENCH)
+	$(BIN)/python -m bench $(BENCH) $(if $(BASE),--base $(BASE))
 
 stills: setup ## draw a still of every encoding of pictures as a viewer gets it: build/stills.png, to be looked at
 	@mkdir -p build

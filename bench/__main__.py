@@ -11,6 +11,7 @@ import traceback
 from pathlib import Path
 
 from bench import RESULTS, ROOT
+from bench.base import compare
 from bench.report import Options, Row, Unavailable, load, machine, save, show
 
 MEASUREMENTS = {
@@ -83,6 +84,9 @@ def arguments() -> argparse.Namespace:
         action="store_true",
         help="exit with 1 also if a bar is missed or a measurement is left out",
     )
+    parser.add_argument(
+        "--base", metavar="COMMIT", help="measure this commit too, in turns, and print both and their ratios"
+    )
     parser.add_argument("--plot", type=Path, help="where a picture of the ratios goes (SVG)")
     return parser.parse_args()
 
@@ -129,9 +133,19 @@ def exit_code(rows: list[Row], missing: dict[str, str], *, strict: bool) -> int:
     return int(bool(missed or missing))
 
 
+def _without_base(options: list[str]) -> list[str]:
+    kept = [each for each in options if not each.startswith("--base=")]
+    if "--base" in kept:
+        at = kept.index("--base")
+        del kept[at : at + 2]
+    return kept
+
+
 def main() -> int:
     """Measure and print; returns the exit code, see :func:`exit_code`."""
     asked = arguments()
+    if asked.base:
+        return compare(asked.base, _without_base(sys.argv[1:]))
     target = asked.json or (None if asked.quick else RESULTS / "latest.json")
     options, measured = Options(asked.quick, asked.seconds, asked.runs), commit()
     rows: list[Row] = []

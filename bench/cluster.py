@@ -131,13 +131,13 @@ class Hops:
         client, pids = self.clients[where]
         message = text_frame(text_message("/chatter", SMALL))
         robot = self.robot
-        return Hop(client, message, lambda: robot.received, pids, WINDOW_SMALL, receiver=robot.channel)
+        return Hop(client, [message], lambda: robot.received, pids, WINDOW_SMALL, receiver=robot.channel)
 
     def down(self, where: str) -> Hop:
         """Robot to client; both clients receive each sample."""
         client, pids = self.clients[where]
         assert self.robot.channel is not None
-        return Hop(self.robot.channel, self._sample, lambda: client.messages, pids, 1, True, client)
+        return Hop(self.robot.channel, [self._sample], lambda: client.messages, pids, 1, True, client)
 
 
 def hops(loop: Loop, relays: list[ClusterRelay], options: Options) -> list[Row]:

@@ -7,9 +7,10 @@ that speaks CDR, converted. The ends are plain (``bench/wire.py``), in this proc
 from __future__ import annotations
 
 import contextlib
+import random
 import statistics
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,17 +47,81 @@ def twist_message(topic: str, size: int) -> bytes:
     return message[:-1].ljust(size - 1) + b"}"
 
 
+VOCABULARY = [
+    "the",
+    "robot",
+    "is",
+    "at",
+    "charger",
+    "door",
+    "corridor",
+    "room",
+    "kitchen",
+    "waits",
+    "for",
+    "goal",
+    "blocked",
+    "by",
+    "a",
+    "person",
+    "battery",
+    "low",
+    "near",
+    "desk",
+    "arrived",
+    "left",
+    "right",
+    "turn",
+    "back",
+    "stopped",
+    "resumed",
+    "speed",
+    "zero",
+    "obstacle",
+    "ahead",
+    "Tür",
+    "geöffnet",
+    "naïve",
+    "21°C",
+]
+
+
+def different_texts(topic: str, count: int) -> list[bytes]:
+    """Different strings of a log, as ``publish`` of about :data:`SMALL` bytes."""
+    chance = random.Random(1)
+    messages = []
+    for number in range(count):
+        words = f"[{number}] {chance.random() * 100:.3f} s: " + " ".join(chance.choices(VOCABULARY, k=17))
+        messages.append(jsontext.encode({"op": "publish", "topic": topic, "msg": {"data": words}}))
+    return messages
+
+
+def different_twists(topic: str, count: int) -> list[bytes]:
+    """Different commands, as :func:`twist_message` has one."""
+    chance = random.Random(1)
+    messages = []
+    for _ in range(count):
+        twist = {
+            "linear": {"x": chance.uniform(-1.0, 1.0), "y": 0.0, "z": 0.0},
+            "angular": {"x": 0.0, "y": 0.0, "z": chance.uniform(-2.0, 2.0)},
+        }
+        message = jsontext.encode({"op": "publish", "topic": topic, "msg": twist})
+        messages.append(message[:-1].ljust(SMALL - 1) + b"}")
+    return messages
+
+
 @dataclass
 class Hop:
     """A way to measure: what is sent, by whom, and how it is known to have come.
 
+    :param messages: one that is sent again and again, or different ones
     :param pids: processes whose processor time counts
     :param window: messages under way at most; with ``single`` one
     :param receiver: where it arrives
     """
 
     sender: End
-    message: bytes
+    messages: Sequence[bytes]
     received: Callable[[], int]
     pids: tuple[int, ...]
     window: int
@@ -67,9 +132,9 @@ class Hop:
         """Microseconds of processor time per message."""
         with measured(*self.pids, children=True) as watch:
             if self.single:
-                one_at_a_time(loop, self.sender, self.message, total, self.received)
+                one_at_a_time(loop, self.sender, self.messages, total, self.received)
             else:
-                flood(loop, self.sender, self.message, total, self.received, self.window)
+                flood(loop, self.sender, self.messages, total, self.received, self.window)
         return watch.seconds * 1e6 / total
 
 
@@ -108,26 +173,31 @@ class Ground:
         self.loop.until("the first sample comes", lambda: client.messages > before)
 
     def _sample(self, robot: PlainRobot, size: int) -> bytes:
-        body = jsontext.decode_any(text_message("/told", size))["msg"]
+        return self._sample_of(robot, text_message("/told", size))
+
+    def _sample_of(self, robot: PlainRobot, message: bytes) -> bytes:
+        body = jsontext.decode_any(message)["msg"]
         return robot.sample(
             "/told",
             jsontext.encode(body) if robot.encoding == "json" else self.types.from_json(STRING, body, 0),
         )
 
-    def to_robot(self, encoding: str, message: bytes, window: int, *, single: bool = False) -> Hop:
+    def to_robot(self, encoding: str, messages: list[bytes], window: int, *, single: bool = False) -> Hop:
         """Client to robot."""
         robot = self.robots[encoding]
         sender = self.clients[encoding]
-        return Hop(
-            sender, text_frame(message), lambda: robot.received, (self.pid,), window, single, robot.channel
-        )
+        sent = [text_frame(message) for message in messages]
+        return Hop(sender, sent, lambda: robot.received, (self.pid,), window, single, robot.channel)
 
-    def to_client(self, encoding: str, size: int, window: int, *, single: bool = False) -> Hop:
-        """Robot to client."""
+    def to_client(self, encoding: str, messages: list[bytes], window: int, *, single: bool = False) -> Hop:
+        """Robot to client.
+
+        :param messages: as a client would publish them
+        """
         robot, client = self.robots[encoding], self.clients[encoding]
-        sample = self._sample(robot, size)
+        samples = [self._sample_of(robot, message) for message in messages]
         assert robot.channel is not None
-        return Hop(robot.channel, sample, lambda: client.messages, (self.pid,), window, single, client)
+        return Hop(robot.channel, samples, lambda: client.messages, (self.pid,), window, single, client)
 
 
 @contextlib.contextmanager
@@ -156,10 +226,10 @@ def through_websockify(
     payload = b"x" * size
     if to_server:
         message = text_frame(payload, binary=True)
-        return Hop(ends.client, message, lambda: ends.server.messages, (ends.pid,), window, single)
+        return Hop(ends.client, [message], lambda: ends.server.messages, (ends.pid,), window, single)
     client = ends.client
     # A stream has no messages: what comes together is sent as one. Bytes are counted.
-    return Hop(ends.server, payload, lambda: client.payload_bytes // size, (ends.pid,), window, single)
+    return Hop(ends.server, [payload], lambda: client.payload_bytes // size, (ends.pid,), window, single)
 
 
 @dataclass
@@ -182,25 +252,34 @@ def cases(ground: Ground, proxy: Any, options: Options) -> list[Case]:
     down_single = through_websockify(proxy, SMALL, to_server=False, window=1, single=True)
     up_large = through_websockify(proxy, LARGE, to_server=True, window=WINDOW_LARGE)
     down_large = through_websockify(proxy, LARGE, to_server=False, window=WINDOW_LARGE)
-    chatter, drive = text_message("/chatter", SMALL), twist_message("/cmd_vel", SMALL)
     merged = "towards a client websockify merges small messages, so flooded ones can't be compared"
     if up_small is None:
         merged = "websockify is not installed (scripts/setup.sh bench): ours alone"
     found = []
+    up = {
+        "String": [text_message("/chatter", SMALL)],
+        "String, each different": different_texts("/chatter", many),
+        "Twist, a motion command": [twist_message("/cmd_vel", SMALL)],
+        "Twist, each different": different_twists("/cmd_vel", many),
+    }
     for encoding, bar in (("json", 0.25), ("cdr", None)):
         name = encoding.upper()
-        for what, message in (("String", chatter), ("Twist, a motion command", drive)):
-            hop = ground.to_robot(encoding, message, WINDOW_SMALL)
+        for what, messages in up.items():
+            hop = ground.to_robot(encoding, messages, WINDOW_SMALL)
             found.append(Case(f"client → {name} robot, 200 B, {what}", hop, up_small, many, bar))
+    down = {"": [text_message("/told", SMALL)], ", each different": different_texts("/told", many)}
     for encoding in ("json", "cdr"):
-        hop = ground.to_client(encoding, SMALL, WINDOW_SMALL)
-        found.append(Case(f"{encoding.upper()} robot → client, 200 B", hop, None, many, note=merged))
-    hop = ground.to_client("cdr", SMALL, 1, single=True)
+        for what, messages in down.items():
+            hop = ground.to_client(encoding, messages, WINDOW_SMALL)
+            found.append(
+                Case(f"{encoding.upper()} robot → client, 200 B{what}", hop, None, many, note=merged)
+            )
+    hop = ground.to_client("cdr", down[""], 1, single=True)
     found.append(Case("CDR robot → client, 200 B, one at a time", hop, down_single, singles))
     large = text_message("/chatter", LARGE)
-    hop = ground.to_robot("json", large, WINDOW_LARGE)
+    hop = ground.to_robot("json", [large], WINDOW_LARGE)
     found.append(Case("client → JSON robot, 64 KiB", hop, up_large, few))
-    hop = ground.to_client("cdr", LARGE, WINDOW_LARGE)
+    hop = ground.to_client("cdr", [text_message("/told", LARGE)], WINDOW_LARGE)
     found.append(Case("CDR robot → client, 64 KiB", hop, down_large, few))
     return found
 

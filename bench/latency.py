@@ -33,7 +33,7 @@ def delays(loop: Loop, hop: Hop, count: int) -> list[float]:
             loop.turn(wait)
         before = hop.received()
         sent = time.perf_counter()
-        hop.sender.send(hop.message)
+        hop.sender.send(hop.messages[0])
         while hop.received() == before:
             loop.turn(1.0)
             assert time.perf_counter() - sent < 10, "a message did not come"
@@ -50,8 +50,8 @@ def through_haproxy(proxy: HAProxy) -> dict[str, Hop]:
     up, down = text_frame(payload), Frame(Opcode.TEXT, payload).serialize(mask=False)
     client, server = proxy.client, proxy.server
     return {
-        "up": Hop(client, up, lambda: server.messages, (proxy.pid,), 1, receiver=server),
-        "down": Hop(server, down, lambda: client.messages, (proxy.pid,), 1, receiver=client),
+        "up": Hop(client, [up], lambda: server.messages, (proxy.pid,), 1, receiver=server),
+        "down": Hop(server, [down], lambda: client.messages, (proxy.pid,), 1, receiver=client),
     }
 
 
@@ -87,11 +87,19 @@ def run(options: Options) -> list[Row]:
         stack.enter_context(running(relay))
         stack.callback(loop.close)
         ground = Ground(loop, relay)
-        chatter = text_message("/chatter", SMALL)
+        chatter, told = text_message("/chatter", SMALL), text_message("/told", SMALL)
         proxy = HAProxy(loop, Path(name), len(text_frame(chatter)))
         stack.callback(proxy.stop)
         theirs = through_haproxy(proxy)
         return [
-            measure(loop, "client → JSON robot", ground.to_robot("json", chatter, 1), theirs["up"], options),
-            measure(loop, "CDR robot → client", ground.to_client("cdr", SMALL, 1), theirs["down"], options),
+            measure(
+                loop, "client → JSON robot", ground.to_robot("json", [chatter], 1), theirs["up"], options
+            ),
+            measure(
+                loop,
+                "CDR robot → client",
+                ground.to_client("cdr", [text_message("/told", SMALL)], 1),
+                theirs["down"],
+                options,
+            ),
         ]

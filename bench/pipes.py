@@ -98,7 +98,7 @@ def whole(here: Ground, options: Options) -> list[Row]:
     assert one.channel is not None
     began = time.perf_counter()
     with measured(here.relay.pid) as watch:
-        flood(here.loop, one.channel, frame, total, lambda: two.received, WINDOW)
+        flood(here.loop, one.channel, [frame], total, lambda: two.received, WINDOW)
     megabytes, seconds = total * len(body) / 1e6, time.perf_counter() - began
     found = here.relay.cli("pipe", "show", "one-cloud")
     note = f"{megabytes / seconds:.0f} MB/s; of {found['messages']} messages {found['messages'] - found['encoded']} "

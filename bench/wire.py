@@ -6,11 +6,12 @@
 
 from __future__ import annotations
 
+import itertools
 import selectors
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from websockets.frames import Frame, Opcode
@@ -337,30 +338,38 @@ class PlainRobot:
 
 
 def flood(
-    loop: Loop, sender: End, message: bytes, total: int, received: Callable[[], int], window: int
+    loop: Loop,
+    sender: End,
+    messages: Sequence[bytes],
+    total: int,
+    received: Callable[[], int],
+    window: int,
 ) -> None:
-    """Send a message many times, with at most a window of them under way, until all have come.
+    """Send messages, one after the other and from the first again, with at most a window of them under way, until all
+    have come.
 
     :param window: messages sent and not yet received; half of it is written at a time
     """
     burst = max(1, window // 2)
-    chunk = message * burst
+    following = itertools.cycle(messages)
     begun, sent = received(), 0
     end = time.monotonic() + 120
     while (came := received() - begun) < total:
         if sent < total and sent - came <= window - burst:
             left = min(burst, total - sent)
-            sender.send(chunk if left == burst else message * left)
+            sender.send(b"".join(itertools.islice(following, left)))
             sent += left
         loop.turn(0.5)
         assert time.monotonic() < end, f"{total - came} of {total} messages did not come"
     assert came == total, f"{came} messages came of {total}"
 
 
-def one_at_a_time(loop: Loop, sender: End, message: bytes, total: int, received: Callable[[], int]) -> None:
+def one_at_a_time(
+    loop: Loop, sender: End, messages: Sequence[bytes], total: int, received: Callable[[], int]
+) -> None:
     """Send a message only when the one before has come."""
     begun = received()
-    for number in range(1, total + 1):
+    for number, message in enumerate(itertools.islice(itertools.cycle(messages), total), 1):
         sender.send(message)
         end = time.monotonic() + 10
         while received() - begun < number:
