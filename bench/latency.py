@@ -98,7 +98,7 @@ def run(options: Options) -> list[Row]:
             measure(
                 loop,
                 "CDR robot → client",
-                ground.to_client("cdr", [text_message("/told", SMALL)], 1),
+                ground.to_client("cdr", [told], 1),
                 theirs["down"],
                 options,
             ),
