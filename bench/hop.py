@@ -54,12 +54,15 @@ right turn back stopped resumed speed zero obstacle ahead Tür geöffnet naïve 
 
 
 def different_texts(topic: str, count: int) -> list[bytes]:
-    """Different strings of a log, as ``publish`` of about :data:`SMALL` bytes."""
+    """Different strings of a log, as ``publish`` of :data:`SMALL` bytes."""
     chance = random.Random(1)
+    empty = jsontext.encode({"op": "publish", "topic": topic, "msg": {"data": ""}})
+    room = SMALL - len(empty)
     messages = []
     for number in range(count):
-        words = f"[{number}] {chance.random() * 100:.3f} s: " + " ".join(chance.choices(VOCABULARY, k=17))
-        messages.append(jsontext.encode({"op": "publish", "topic": topic, "msg": {"data": words}}))
+        words = f"[{number}] {chance.random() * 100:.3f} s: " + " ".join(chance.choices(VOCABULARY, k=40))
+        data = words.encode()[:room].decode(errors="ignore").ljust(room)
+        messages.append(empty.replace(b'""', b'"%s"' % data.encode()[:room]))
     return messages
 
 
