@@ -19,6 +19,9 @@ from relay_server.common.clock import Clock, Timer, cancel
 MAX_SAMPLES = 1000
 """Most latched samples stored of one topic."""
 
+MAX_STAMPS = 4 * MAX_SAMPLES
+"""Most stamps of samples that came, also of those that are not stored any more."""
+
 MAX_UNREPORTED = 64
 """Most latched samples, one for each publisher, of a robot that can't report which are still kept."""
 
@@ -72,6 +75,10 @@ class LatchedSamples:
         self.request_due = False
         """Whether a request is due."""
         self.newest = 0
+        self._came: set[int] = set()
+        """Stamps of the samples that came, without those up to :attr:`_earliest`."""
+        self._earliest = 0
+        """Samples up to this stamp are taken to have come."""
         self._limit = 1
         self._samples: dict[int, Sample] = {}
         self._bytes = 0
@@ -115,12 +122,14 @@ class LatchedSamples:
     def begin(self, stamp: int) -> None:
         """Note that the topic is latched; samples up to this stamp came before that was known."""
         self.newest = max(self.newest, stamp)
+        self._earliest = max(self._earliest, stamp)
 
     def forget(self) -> None:
         """Drop all samples, as they are no longer those of the topic."""
         self.lost()
         self._samples.clear()
-        self._bytes = self.newest = 0
+        self._bytes = self.newest = self._earliest = 0
+        self._came.clear()
 
     def lost(self) -> None:
         """Handle the loss of the link. Samples stay: a robot with the same memory continues with its stamps."""
@@ -198,8 +207,8 @@ class LatchedSamples:
     def add(self, frame_stamp: int, sample: Sample) -> bool:
         """Take a sample from the robot; return whether it is new to all members that receive live samples.
 
-        :param frame_stamp: one that is not newer than all before it repeats a sample; the body is empty if the relay
-            has it. 0 with an empty body ends a request.
+        :param frame_stamp: one that came before repeats a sample; the body is empty if the relay has it. 0 with an
+            empty body ends a request. Those of several publishers may come in another order than at first.
         """
         if not self.memory:
             self.newest += 1
@@ -207,7 +216,11 @@ class LatchedSamples:
             return True
         if frame_stamp > self.newest:
             self.newest = frame_stamp
+            self._note(frame_stamp)
             self._store(frame_stamp, sample)
+            return True
+        if sample.size and frame_stamp > self._earliest and frame_stamp not in self._came:
+            self._add_late(frame_stamp, sample)
             return True
         if frame_stamp == 0 and not sample.size:
             self._request_ended()
@@ -223,6 +236,26 @@ class LatchedSamples:
         for joiner in list(self._joiners.values()):
             joiner.replay(frame_stamp, known)
         return False
+
+    def _add_late(self, stamp: int, sample: Sample) -> None:
+        """Take a sample that is new, but older than another that has come."""
+        self._note(stamp)
+        self._store(stamp, sample)
+        if stamp in self._samples:
+            self._confirmed.add(stamp)
+        for joiner in list(self._joiners.values()):
+            if joiner.live:
+                joiner.received.add(stamp)
+            else:
+                joiner.replay(stamp, sample)
+
+    def _note(self, stamp: int) -> None:
+        self._came.add(stamp)
+        if len(self._came) > MAX_STAMPS:
+            # Half at once, so that not every further sample costs a search.
+            came = sorted(self._came)
+            self._earliest = came[MAX_STAMPS // 2]
+            self._came = set(came[MAX_STAMPS // 2 + 1 :])
 
     def _request_ended(self) -> None:
         """End a request, and drop the samples that no publisher keeps any more."""

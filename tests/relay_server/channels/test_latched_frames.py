@@ -67,6 +67,29 @@ def test_late_joiners_get_the_samples_that_publishers_keep(scene: Scene) -> None
     assert heard(scene.first) == []
 
 
+def test_samples_that_come_in_another_order_than_at_first_all_arrive(world: World) -> None:
+    """A robot knows the stamps of an earlier subscription, and its middleware delivers several publishers in any
+    order. Each sample arrives once.
+    """
+    robot = RobotLink(world)
+    person = world.person()
+    robot.joins()
+    person.says("subscribe", topic=TOPIC)
+    number = robot.subscribed(TOPIC, **HERE)
+    for stamp in (6, 2, 7, 1, 2, 6):
+        robot.sample(number, text(str(stamp)), stamp)
+    assert heard(person) == ["6", "2", "7", "1"]
+    late = world.person()
+    late.says("subscribe", topic=TOPIC)
+    robot.sample(number, text("4"), 4)
+    robot.subscribed(TOPIC, **HERE)
+    for stamp in (1, 2, 4, 6, 7):
+        robot.sample(number, b"", stamp)
+    robot.sample(number, b"", 0)
+    assert sorted(heard(late)) == ["1", "2", "4", "6", "7"]
+    assert heard(person) == ["4"]
+
+
 def test_second_subscription_of_a_connection_gets_them_too(scene: Scene) -> None:
     """Its id is another one; live samples go on, each once."""
     scene.first.says("subscribe", topic=TOPIC, id="second")
