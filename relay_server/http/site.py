@@ -95,6 +95,7 @@ class DeadlineChannel(HTTPChannel):
 
     log = Logger()
     maxHeaders = request_fields.FIELDS
+    _path: bytes
     _deadline: Timer | None = None
     _address = ""
     _refused = False
@@ -175,7 +176,13 @@ class DeadlineChannel(HTTPChannel):
     def allHeadersReceived(self) -> None:
         """Check the complete head before parsers read it."""
         request_fields.check_target(self._path)
-        request_fields.check_fields(self.requests[-1].requestHeaders)
+        headers = self.requests[-1].requestHeaders
+        absolute = request_fields.split_absolute(self._path)
+        if absolute is not None:
+            # It replaces the field (RFC 9112 section 3.2.2).
+            host, self._path = absolute
+            headers.setRawHeaders(b"host", [host])
+        request_fields.check_fields(headers)
         super().allHeadersReceived()
 
     def allContentReceived(self) -> None:
