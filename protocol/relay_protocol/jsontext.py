@@ -24,6 +24,7 @@ from typing import Any, TypeVar, get_args
 
 import msgspec
 
+from relay_protocol import json_cost
 from relay_protocol.errors import MalformedMessage
 from relay_protocol.limits import JSON_DEPTH
 
@@ -75,9 +76,7 @@ _LIST = ord("[")
 
 def _deepest(data: bytes) -> int:
     """Deepest nesting, by a running sum of brackets outside strings (all loops are in C)."""
-    unescaped = data.replace(b"\\\\", b"").replace(b'\\"', b"")
-    outside = b"".join(unescaped.split(b'"')[::2])
-    steps = memoryview(outside.translate(_STEPS, _NOT_BRACKETS)).cast("b")
+    steps = memoryview(json_cost.outside_strings(data).translate(_STEPS, _NOT_BRACKETS)).cast("b")
     return max(accumulate(steps), default=0)
 
 
@@ -119,6 +118,7 @@ _ANY: msgspec.json.Decoder[Any] = msgspec.json.Decoder()
 
 def decode_any(data: bytes) -> Any:
     """Decode a checked message without a schema; see :func:`decode`."""
+    _check_longest_numbers(data)
     value = decode(_ANY, data)
     if len(data) >= _DIGITS_OF_DOUBLE:
         _check_long_numbers(data)
@@ -131,6 +131,7 @@ def recode(data: bytes) -> bytes:
     :raises MalformedMessage: as :func:`decode_any`
     """
     check_text(data)
+    _check_longest_numbers(data)
     try:
         value = _ANY.decode(data)
     except FAULTS as error:
@@ -155,6 +156,15 @@ def in_range(data: bytes) -> bool:
     return len(data) < _DIGITS_OF_DOUBLE and _LARGE_E not in data and _exponent(data) is None
 
 
+def _check_longest_numbers(data: bytes) -> None:
+    """Refuse a large text with numbers that take long to read, before it is decoded."""
+    if json_cost.has_long_numbers(data):
+        raise MalformedMessage(_OUT_OF_RANGE)
+
+
+_OUT_OF_RANGE = "the message is not JSON: a number is out of range"
+
+
 def _check_long_numbers(data: bytes) -> None:
     """Refuse JSON with a number that no double can hold: msgspec takes integers of any length."""
     if _LONG_RUN in data.translate(_ALL_DIGITS_ALIKE):
@@ -164,7 +174,7 @@ def _check_long_numbers(data: bytes) -> None:
 def _in_range(digits: str) -> float:
     value = float(digits)
     if math.isinf(value):
-        raise MalformedMessage("the message is not JSON: a number is out of range")
+        raise MalformedMessage(_OUT_OF_RANGE)
     return value
 
 

@@ -29,6 +29,12 @@ class Origins:
         self.tls = scheme == "https"
         self._scheme = scheme
         self._listed = {_checked(each) for each in listed}
+        self.listed = tuple(map(str, sorted(self._listed)))
+        """The listed origins, as browsers write them."""
+
+    def is_listed(self, origin: str) -> bool:
+        """Whether an ``Origin`` is listed."""
+        return _parse(origin) in self._listed
 
     def base(self, host: str) -> str:
         """``scheme://host[:port]`` of this relay for a client that sent this ``Host``.
@@ -64,15 +70,26 @@ class Origins:
             )
 
 
+_PORTS = {"http": 80, "https": 443}
+
+
 class _Origin(NamedTuple):
     scheme: str
     host: str
     port: int
 
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.scheme}://{host}" + ("" if self.port == _PORTS[self.scheme] else f":{self.port}")
+
 
 def _checked(listed: str) -> _Origin:
     origin = _parse(listed)
-    if origin is None or urlsplit(listed).path.strip("/"):
+    if (
+        origin is None
+        or urlsplit(listed).path.strip("/")
+        or _HOST.match(str(origin).partition("://")[2]) is None
+    ):
         raise Invalid(f"'{listed}' is not an origin; write https://host or https://host:port")
     return origin
 
@@ -84,7 +101,7 @@ def _parse(text: str) -> _Origin | None:
         port = parts.port
     except ValueError:
         return None
-    standard = {"http": 80, "https": 443}.get(parts.scheme)
+    standard = _PORTS.get(parts.scheme)
     if standard is None or not parts.hostname:
         return None
     return _Origin(parts.scheme, parts.hostname, port or standard)

@@ -267,7 +267,11 @@ class Forwarder:
             return True
         request.setResponseCode(response.code, response.phrase)
         for name, values in response.headers.getAllRawHeaders():
-            if name.lower() not in _OF_FIRST_RELAY:
+            if name.lower() == b"vary":
+                # This relay has a line of its own.
+                for value in values:
+                    request.responseHeaders.addRawHeader(name, value)
+            elif name.lower() not in _OF_FIRST_RELAY:
                 request.responseHeaders.setRawHeaders(name, values)
         if request.method != b"HEAD":
             await _AnswerPipe(request).run(response)

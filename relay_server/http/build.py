@@ -23,6 +23,7 @@ from relay_server.files.http import FileEndpoints
 from relay_server.fleet.http import FleetEndpoints
 from relay_server.foxglove_urls.http import FoxgloveUrlEndpoints
 from relay_server.http.authentication import RequestAuthenticator
+from relay_server.http.cross_origin import CrossOrigin
 from relay_server.http.idempotency import Idempotency
 from relay_server.http.limits import ConnectionLimits, RequestLimits, UncountedConnections
 from relay_server.http.live_updates import Source, Sources
@@ -116,7 +117,15 @@ def build_http(services: Services, local: IResource) -> HttpSite:
     programs = _programs(services)
     connections = ConnectionLimits(settings.connections)
     root = _root(services, router, updates, programs, connections, limits, forwarding)
-    site = RelaySite(root, core.reactor, connections, settings.tls, limits, authenticator.remembers)
+    site = RelaySite(
+        root,
+        core.reactor,
+        connections,
+        settings.tls,
+        limits,
+        authenticator.remembers,
+        CrossOrigin(core.origins),
+    )
     cluster_site = None
     if core.cluster is not None:
         secret = core.cluster.settings.secret

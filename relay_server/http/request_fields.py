@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from twisted.web.http_headers import Headers
 from twisted.web.server import Request
 from werkzeug.http import parse_dict_header, parse_etags
@@ -103,6 +105,27 @@ def check_target(target: bytes) -> None:
         raise BadHead(
             b"400 Bad Request", "path and query must be ASCII without spaces; write other characters as %XX"
         )
+
+
+_ABSOLUTE = re.compile(rb"https?://(?P<host>[^/?#@]+)(?P<rest>(?:[/?][^#]*)?)\Z", re.IGNORECASE)
+
+
+def split_absolute(target: bytes) -> tuple[bytes, bytes] | None:
+    """``Host``, and path with query, of a target in absolute form (RFC 9112 section 3.2.2).
+
+    Clients send this form to proxies, and some proxies pass it on.
+
+    :returns: ``None``: the target has another form
+    :raises BadHead: scheme or host are not those of HTTP, or it has a user or a fragment
+    """
+    if target.startswith(b"/") or b"://" not in target:
+        return None
+    found = _ABSOLUTE.match(target)
+    if found is None:
+        raise BadHead(b"400 Bad Request", "a whole address in the request line must be http://host/path")
+    host, rest = found["host"], found["rest"]
+    _check_length(b"host", len(host))
+    return host, rest if rest.startswith(b"/") else b"/" + rest
 
 
 def check_fields(headers: Headers) -> None:

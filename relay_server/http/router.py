@@ -429,7 +429,7 @@ def _form(request: ApiRequest, forms: tuple[MediaType, ...]) -> MediaType:
     """
     if len(forms) == 1:
         return forms[0]
-    request.http.setHeader(b"vary", b"Accept")
+    request.http.responseHeaders.addRawHeader(b"vary", b"Accept")
     choose = wanted if any(each.mark for each in forms) else preferred
     return choose(field_lines(request.http, "accept"), forms)
 

@@ -28,6 +28,7 @@ from relay_server.cluster.forwarding import (
 from relay_server.common.clock import Timer, cancel
 from relay_server.common.tcp import keep_little, tcp_of
 from relay_server.http import request_fields
+from relay_server.http.cross_origin import CrossOrigin
 from relay_server.http.limits import (
     ConnectionLimits,
     LargeBodyLimits,
@@ -95,6 +96,7 @@ class DeadlineChannel(HTTPChannel):
 
     log = Logger()
     maxHeaders = request_fields.FIELDS
+    _path: bytes
     _deadline: Timer | None = None
     _address = ""
     _refused = False
@@ -175,7 +177,13 @@ class DeadlineChannel(HTTPChannel):
     def allHeadersReceived(self) -> None:
         """Check the complete head before parsers read it."""
         request_fields.check_target(self._path)
-        request_fields.check_fields(self.requests[-1].requestHeaders)
+        headers = self.requests[-1].requestHeaders
+        absolute = request_fields.split_absolute(self._path)
+        if absolute is not None:
+            # It replaces the field (RFC 9112 section 3.2.2).
+            host, self._path = absolute
+            headers.setRawHeaders(b"host", [host])
+        request_fields.check_fields(headers)
         super().allHeadersReceived()
 
     def allContentReceived(self) -> None:
@@ -377,6 +385,8 @@ class BoundedRequest(Request):
     log = Logger()
     forwarded: ForwardedClient | None = None
     """The client of a request that another relay of the cluster has forwarded; it has authenticated the client."""
+    from_listed_page = False
+    """Whether a page of a listed origin sent this request, by its ``Origin``."""
     known = False
     """Whether this request carried valid credentials of a user or an OAuth client."""
     _chunks: int | None = None
@@ -418,6 +428,8 @@ class BoundedRequest(Request):
             # Twisted fails when a header that is not text is read as text (RFC 9110 section 5.5).
             headers.setRawHeaders(name, [each.decode(errors="replace").encode() for each in values])
         try:
+            if self.site.answers_preflight(self):
+                return
             super().process()
         except Exception:
             # The request is complete, so this is not the sender's error. Twisted handles errors of resources itself.
@@ -469,6 +481,7 @@ class RelaySite(Site):
     """The site of a relay, with security headers in each answer and without an access log (URLs may carry tickets).
 
     :param remembers: whether the sender of a request is known, without asking the database
+    :param cross_origin: the rules for pages of listed origins; ``None``: there are none
     """
 
     requestFactory = BoundedRequest
@@ -483,6 +496,7 @@ class RelaySite(Site):
         tls: bool,
         request_limits: RequestLimits,
         remembers: Callable[[Request], bool] = lambda request: False,
+        cross_origin: CrossOrigin | None = None,
     ) -> None:
         super().__init__(
             root,
@@ -496,6 +510,7 @@ class RelaySite(Site):
         self.limits = request_limits
         self.unsent = Unsent()
         self.remembers = remembers
+        self.cross_origin = cross_origin
         self.large_bodies = LargeBodyLimits()
         self._headers = dict(SECURITY_HEADERS)
         if tls:
@@ -510,6 +525,11 @@ class RelaySite(Site):
         channel.timeOut = IDLE_SECONDS
         channel.callLater = self.reactor.callLater
         return channel
+
+    def answers_preflight(self, request: Request) -> bool:
+        """Allow what a page of a listed origin may do; returns whether the request is answered by that."""
+        of_api = request.path[1:].partition(b"/")[0] in (*ROUTED, b"robots")
+        return self.cross_origin is not None and of_api and self.cross_origin.allow(request)
 
     def log(self, request: Any) -> None:
         """Log nothing. Decisions are logged where they are made, without secrets."""

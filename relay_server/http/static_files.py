@@ -71,7 +71,7 @@ class StaticFile:
         # Each encoding needs an entity tag of its own (RFC 9110 section 8.8.3.3).
         request.setHeader(b"etag", f'"{self._tag}-gzip"' if packed else f'"{self._tag}"')
         if self._gzip:
-            request.setHeader(b"vary", b"accept-encoding")
+            request.responseHeaders.addRawHeader(b"vary", b"accept-encoding")
         if tags & if_none_match(request):
             request.setResponseCode(304)
             return b""

@@ -105,13 +105,17 @@ class TopicEndpoints(GraphCollection):
     async def newest_message(
         self, request: ApiRequest, robot: str, name: str, query: TopicQuery
     ) -> Representation[TopicMessage] | Streamed | Document:
+        head = request.http.method == b"HEAD"
         if request.form is EVENTS:
-            return self._stream(request, robot, name, query)
+            stream = self._stream(request, robot, name, query)
+            if head:
+                await self._service.may(caller_at(request, robot), Operation.SUBSCRIBE, name)
+            return stream
         if query.throttle_ms is not UNSET:
             raise Invalid("'throttle_ms' applies to streams: request text/event-stream, or remove it")
         if query.whole:
             raise Invalid("'whole' applies to streams: request text/event-stream, or remove it")
-        if query.next and request.http.method == b"HEAD":
+        if query.next and head:
             # Clients that poll ask for the head first, and do not wait for it.
             await self._service.may(caller_at(request, robot), Operation.SUBSCRIBE, name)
             return Document(b"", JSON.media)

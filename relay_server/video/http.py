@@ -1,6 +1,7 @@
 """``/robots/<robot>/video/…`` over HTTP: cameras, MJPEG streams, snapshots, and the upgrade to a websocket.
 
-A session cookie needs no Origin here, because an ``<img>`` sends none. Pages of other sites are refused instead.
+A session cookie needs no Origin here, because an ``<img>`` sends none. Pages of other sites are refused instead, unless
+they send an Origin that is listed.
 """
 
 from __future__ import annotations
@@ -268,12 +269,17 @@ class VideoResource(Resource):
         )
     )
     async def _stream_viewer(self, request: Request, robot: str) -> bytes:
-        """The page contains nothing of the robot, so it needs no credentials. The stream in it does."""
+        """The page contains nothing of the robot, so it needs no credentials. The stream in it does.
+
+        Pages of listed origins may show it in a frame. The session cookie does not count there, so they give a ticket.
+        """
         query = _query(request)
         wanted = parse_parameters(query, "stream")
         title = html.escape(f"{wanted.camera} of {robot}")
         content = _BY_HTTP if wanted.settings.codec == "png" else _BY_WEBSOCKET
         request.setHeader(b"content-type", b"text/html; charset=utf-8")
+        if request.site.cross_origin is not None:
+            request.site.cross_origin.allow_frames(request)
         return _VIEWER.format(
             title=title, content=content.format(title=title, query=html.escape(query))
         ).encode()
@@ -345,7 +351,8 @@ class VideoResource(Resource):
                 # Pages of other sites may use a ticket, in an <img>.
                 request.setHeader(b"cross-origin-resource-policy", b"cross-origin")
                 return principal
-            if request.getHeader(b"sec-fetch-site") not in _OWN_PAGES:
+            own = request.from_listed_page or request.getHeader(b"sec-fetch-site") in _OWN_PAGES
+            if not own:
                 raise Refused("pages of other sites may not use your session: request a ticket for them")
         return await in_time(request, self._principal_of(request))
 

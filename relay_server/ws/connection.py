@@ -23,12 +23,13 @@ from twisted.logger import Logger
 from relay_protocol import limits, rosbridge
 from relay_protocol.errors import PeerError, SwitchboardError, Unavailable
 from relay_protocol.nonfinite import NotFinite
-from relay_server.access import BadCredentials, Principal
+from relay_server.access import LOOKUP_SECONDS, NOT_LOOKED_UP, BadCredentials, Principal
 from relay_server.auth.authenticator import TicketPurpose, TooManyTries
 from relay_server.cluster.forwarding import ForwardedClient, RequestForwarding
 from relay_server.cluster.websockets import ForwardedHandshake, ForwardedWebSocket
 from relay_server.common import close_codes, websocket_frames
 from relay_server.common.clock import Clock, Timer, cancel
+from relay_server.common.concurrency import with_timeout
 from relay_server.common.pacing import Pacer
 from relay_server.common.socket_writer import FlushScheduler
 from relay_server.common.tcp import keep_little, tcp_of
@@ -218,9 +219,9 @@ class ClientConnection(BoundedProtocol):
                 raise Unavailable("the relay is going down; connect again in a moment")
             if self._slot is None:
                 raise Unavailable("too many clients connect at the same time; try again in a moment")
-            principal = await self._identify(request, purpose)
-            if principal is not None:
-                self._admission = await self._admit(principal)
+            looked_up = self._look_up(request, purpose)
+            # The limit for the whole handshake would drop the connection without an answer.
+            if await with_timeout(self.factory.clock, LOOKUP_SECONDS, looked_up, NOT_LOOKED_UP):
                 await self._open_elsewhere()
             elif self._foxglove:
                 raise BadCredentials(NO_CREDENTIALS)
@@ -236,6 +237,17 @@ class ClientConnection(BoundedProtocol):
             self._log_refused(reason, self._failure.code)
             raise ConnectionDeny(status_of(self._failure), reason)
         return foxglove or subprotocol(request.protocols)
+
+    async def _look_up(self, request: ConnectionRequest, purpose: TicketPurpose) -> bool:
+        """Authenticate and authorize the client.
+
+        :returns: false: the handshake has no credentials
+        """
+        principal = await self._identify(request, purpose)
+        if principal is None:
+            return False
+        self._admission = await self._admit(principal)
+        return True
 
     async def _identify(self, request: ConnectionRequest, purpose: TicketPurpose) -> Principal | None:
         """Authenticate the client, and count the handshake as a request of its user.
@@ -304,7 +316,10 @@ class ClientConnection(BoundedProtocol):
 
     def _not_authenticated(self) -> None:
         self._deadline = None
-        if self._open:
+        if self._open and self._authenticating:
+            # The message came shortly before the deadline.
+            self.close(close_codes.UNAVAILABLE, NOT_LOOKED_UP)
+        elif self._open:
             self.close(
                 close_codes.UNAUTHENTICATED,
                 f"{NO_CREDENTIALS}, nor an auth message",
@@ -439,13 +454,17 @@ class ClientConnection(BoundedProtocol):
         Deferred.fromCoroutine(self._open_by_token(message.mac)).addErrback(self._failed)
 
     async def _open_by_token(self, token: str) -> None:
-        principal = await self.factory.auth.bearer(token)
-        self._admission = await self._admit(principal)
+        looked_up = self._look_up_token(token)
+        await with_timeout(self.factory.clock, LOOKUP_SECONDS, looked_up, NOT_LOOKED_UP)
         await self._open_elsewhere(early=True)
         if self._open:
             self._begin_session()
         else:
             self._release()
+
+    async def _look_up_token(self, token: str) -> None:
+        principal = await self.factory.auth.bearer(token)
+        self._admission = await self._admit(principal)
 
     def _release(self) -> None:
         admission, self._admission = self._admission, None

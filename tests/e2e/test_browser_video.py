@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 import psutil
 import pytest
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import Browser, Error, Locator, Page, expect
 
 from tests.worlds.browser import checked_pages, open_session, running_world
 from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.http_requests import ask
+from tests.worlds.other_pages import OtherPages, readme_example
 from tests.worlds.relay_process import Relay
 from tests.worlds.robot_process import Robot
 from tests.worlds.video_clients import CAMERA, decoded, get
@@ -42,7 +44,8 @@ class World:
         self.modules = folder / "modules"
         """Where the robot's Python looks for modules first."""
         self.modules.mkdir()
-        self.relay = Relay(folder)
+        self.pages = OtherPages(folder / "pages")
+        self.relay = Relay(folder, "--origin", self.pages.listed)
         # With an installed ROS, unlike a wheel, its modules are found by this path.
         paths = os.pathsep.join(filter(None, (str(self.modules), os.environ.get("PYTHONPATH"))))
         self.robot = Robot(
@@ -100,6 +103,7 @@ class World:
         return sum(bool(each.raddr) and each.raddr.port == self.relay.robots_port for each in connections)
 
     def stop(self) -> None:
+        self.pages.stop()
         self.robot.stop()
         self.relay.stop()
 
@@ -325,6 +329,79 @@ def test_the_page_of_a_stream_holds_no_http_connection_and_pauses_while_it_is_hi
     wait_for("frames come", lambda: page.evaluate("document.querySelector('img').src") != before)
     for each in pages[1:]:
         each.close()
+
+
+def foreign(browser: Browser, world: World, url: str) -> Page:
+    """A page of another site, which has no session with the relay."""
+    page = browser.new_context(base_url=url).new_page()
+    page.set_default_timeout(WAIT_SECONDS * 1000)
+    page.goto("/")
+    return page
+
+
+def ticket(world: World) -> str:
+    """A ticket for all cameras."""
+    answer = ask(
+        world.relay.http_port,
+        "POST",
+        "/api/v1/tickets",
+        {"robot": "rover", "for": "video"},
+        token=world.watcher,
+    )
+    return str(answer.json["ticket"])
+
+
+def test_the_example_of_the_readme_runs_on_a_page_of_a_listed_origin(world: World, browser: Browser) -> None:
+    """With an unmodified roslib.js, from another site. From an origin that is not listed it gets no ticket."""
+    address = f"127.0.0.1:{world.relay.http_port}"
+    world.pages.add_program("example.js", readme_example(address, "rover", world.watcher))
+    page = foreign(browser, world, world.pages.listed)
+    with page.expect_console_message() as odometry:
+        page.add_script_tag(url="/example.js", type="module")
+    message = odometry.value.args[0].json_value()
+    assert message.keys() == {"header", "child_frame_id", "pose", "twist"}
+    page.context.close()
+    page = foreign(browser, world, world.pages.unlisted)
+    with page.expect_event("pageerror") as refused:
+        page.add_script_tag(url="/example.js", type="module")
+    assert "Failed to fetch" in str(refused.value)
+    page.context.close()
+
+
+FRAME = """([relay, query]) => {
+  const frame = document.createElement('iframe')
+  frame.src = `http://${relay}/robots/rover/video/stream_viewer?${query}`
+  document.body.append(frame)
+}"""
+DRAWN = """async ([relay, query]) => {
+  const image = new Image()
+  image.crossOrigin = 'anonymous'
+  image.src = `http://${relay}/robots/rover/video/snapshot?${query}`
+  await image.decode()
+  const canvas = document.createElement('canvas')
+  canvas.getContext('2d').drawImage(image, 0, 0)
+  return canvas.getContext('2d').getImageData(0, 0, 1, 1).data.length
+}"""
+
+
+def test_a_page_of_a_listed_origin_shows_a_camera(world: World, browser: Browser) -> None:
+    """The page of a stream in a frame, and a snapshot in a canvas, each by a ticket."""
+    address = f"127.0.0.1:{world.relay.http_port}"
+
+    def query() -> str:
+        return f"topic={CAMERA}&width=320&ticket={ticket(world)}"
+
+    page = foreign(browser, world, world.pages.listed)
+    page.evaluate(FRAME, [address, query()])
+    expect(page.frame_locator("iframe").locator("img")).to_have_js_property("naturalWidth", 320)
+    assert page.evaluate(DRAWN, [address, query()]) == 4
+    page.context.close()
+    page = foreign(browser, world, world.pages.unlisted)
+    with page.expect_console_message(lambda message: "frame-ancestors" in message.text):
+        page.evaluate(FRAME, [address, query()])
+    with pytest.raises(Error, match="cannot be decoded"):
+        page.evaluate(DRAWN, [address, query()])
+    page.context.close()
 
 
 def test_h264_is_shown(world: World, open_page: OpenPage) -> None:

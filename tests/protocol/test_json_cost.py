@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
-from relay_protocol import json_cost, limits, nonfinite, rosbridge
-from relay_protocol.errors import SwitchboardError
+from relay_protocol import json_cost, jsontext, limits, nonfinite, rosbridge
+from relay_protocol.errors import Invalid, MalformedMessage, SwitchboardError
 from relay_protocol.limits import KIB
 from relay_protocol.ros_types import TypeRegistry
 from tests.worlds.growth import grows_linearly, ratio_stays_below
@@ -17,10 +17,12 @@ from tests.worlds.growth import grows_linearly, ratio_stays_below
 LARGEST = limits.CLIENT_MESSAGE
 TYPES = TypeRegistry()
 POINT = "MSG: a/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
-for kind in ("float64", "float32", "int8", "uint8", "string", "a/Point"):
+for kind in ("float64", "float32", "int8", "uint8", "string", "wstring", "a/Point"):
     name = f"a/msg/Of{kind.rpartition('/')[2].capitalize()}"
     TYPES.add(name, f"{kind}[] data\n" + ("=" * 80 + "\n" + POINT if "/" in kind else ""))
 TYPES.add("a/msg/Text", "string data\n")
+TYPES.add("a/msg/Wide", "wstring data\n")
+TYPES.add("a/msg/OfUint64", "uint64[] data\n")
 
 
 def message_of(data: bytes) -> bytes:
@@ -72,6 +74,15 @@ SHAPES: dict[str, tuple[Callable[[int], bytes], str]] = {
     "bytes": (listed(b"1,"), "a/msg/OfInt8"),
     "bytes with a point": (listed(b"1.0,"), "a/msg/OfInt8"),
     "long numbers": (listed(b"0.1234567890123456,"), "a/msg/OfFloat64"),
+    "numbers of 4000 digits": (listed(b"1" * 4000 + b","), "a/msg/OfUint64"),
+    "floats of 4000 digits": (listed(b"1" * 4000 + b","), "a/msg/OfFloat64"),
+    "numbers of 1000 digits": (listed(b"1" * 1000 + b","), "a/msg/OfUint64"),
+    "wide text": (text(b"A"), "a/msg/Wide"),
+    "wide text, two bytes each": (text("ä".encode()), "a/msg/Wide"),
+    "wide text of surrogate pairs": (text("😀".encode()), "a/msg/Wide"),
+    "base64 with a line break at each character": (text(b"A\\n"), "a/msg/OfUint8"),
+    "line breaks for base64": (text(b"\\r\\n"), "a/msg/OfUint8"),
+    "other text for base64": (text("ä\\n".encode()), "a/msg/OfUint8"),
     "short numbers": (listed(b"1,"), "a/msg/OfFloat64"),
     "a long number": (lambda size: message_of(b"1" * size), "a/msg/Text"),
     "objects": (listed(b'{"x":1,"y":2},'), "a/msg/OfPoint"),
@@ -157,6 +168,30 @@ def test_large_message_of_an_allowed_kind_is_accepted() -> None:
         assert handle(text(plain)(LARGEST - 1000), "a/msg/Text") == ""
     raw = base64.b64encode(bytes(7_000_000))
     assert handle(message_of(b'"' + raw + b'"'), "a/msg/OfUint8") == ""
+
+
+def test_long_numbers_of_a_large_message_are_refused_unread() -> None:
+    """Also where no type says that they are numbers, and not where they stand in a string."""
+    long = b"1" * json_cost.LONG_NUMBER
+    many = listed(long + b",")(json_cost.LARGE)
+    with pytest.raises(json_cost.TooCostly, match="no number of 1024 digits or more"):
+        rosbridge.decode(many)
+    for read in (jsontext.decode_any, jsontext.recode):
+        with pytest.raises(MalformedMessage, match="a number is out of range"):
+            read(many)
+    beside = message_of(b'"' + long * 1000 + b'","x":["\\"' + long + b'\\\\",' + b"1," * 1000 + b"1]")
+    assert isinstance(rosbridge.decode(beside), rosbridge.Publish)
+    assert isinstance(rosbridge.decode(listed(b"1" * 1023 + b",")(json_cost.LARGE)), rosbridge.Publish)
+
+
+def test_a_wide_text_that_is_too_long_is_refused_by_its_length() -> None:
+    for letter in ("a", "ä", "😀"):
+        for name in ("Wide", "OfWstring"):
+            value = letter * (limits.RELAY_FRAME // (8 if letter == "😀" else 4))
+            data = {"data": value if name == "Wide" else [value]}
+            with pytest.raises(Invalid, match="bytes") as refused:
+                TYPES.from_json(f"a/msg/{name}", data, 0)
+            assert "16777" in str(refused.value)
 
 
 def test_a_large_message_may_hold_nan() -> None:

@@ -20,6 +20,7 @@ from relay_server.auth.authenticator import TicketPurpose, TooManyTries
 from relay_server.auth.origins import Origins
 from relay_server.common.freshness_tokens import FreshnessTokens
 from relay_server.http.authentication import RequestAuthenticator
+from relay_server.http.cross_origin import CrossOrigin
 from relay_server.http.limits import ConnectionLimits, RequestLimits
 from relay_server.http.live_updates import Sources
 from relay_server.http.logins import LoginEndpoints
@@ -232,7 +233,7 @@ class World:
             self.router.add(DocumentEndpoints("1.2.3", "sb"))
         root = Root(robots, self.router, Portal(folder), pages)
         remembers = self.router.authenticator.remembers
-        self.site = RelaySite(root, self.clock, self.cap, tls, limits, remembers)
+        self.site = RelaySite(root, self.clock, self.cap, tls, limits, remembers, CrossOrigin(origins))
 
     def connect(self) -> Transport:
         """A new connection."""

@@ -35,6 +35,7 @@ from relay_server.control.controllers import Controllers
 from relay_server.control.service import ControlService
 from relay_server.control.types import ControlRules
 from relay_server.events.bus import BusEvent, EventBus
+from relay_server.http.cross_origin import CrossOrigin
 from relay_server.http.limits import ConnectionLimits, RequestLimits
 from relay_server.http.site import Missing, RelaySite, RobotAddress, Root
 from relay_server.listeners import ServerTls
@@ -58,6 +59,8 @@ from tests.worlds.waiting import PATIENCE
 HOST = "127.0.0.1:9090"
 CAMERA = "/camera/image"
 SECRET = "/secret/image"
+PAGE = "https://pages.example"
+"""A listed origin."""
 STREAM = f"/robots/rover/video/stream?topic={CAMERA}"
 SNAPSHOT = f"/robots/rover/video/snapshot?topic={CAMERA}"
 CAMERAS = "/robots/rover/video/cameras"
@@ -91,7 +94,7 @@ class Show:
         self.auth = Authenticator(clock, store, time.monotonic, time.time)
         self.videos = CameraStreams(clock, new_ticket=passwords.new_token)
         channels = Channels(clock, linger=5.0, new_ticket=passwords.new_token, wall_ns=time.time_ns)
-        origins = Origins("http")
+        origins = Origins("http", [PAGE])
         self.bus = EventBus()
         self.published: list[BusEvent] = []
         self.bus.subscribe(self.published.append)
@@ -140,7 +143,7 @@ class Show:
         )
         robots = RobotAddress(websocket, video, "1.2.3")
         root = Root(robots, router, Missing(), Missing())
-        site = RelaySite(root, clock, cap, tls is not None, limits)
+        site = RelaySite(root, clock, cap, tls is not None, limits, cross_origin=CrossOrigin(origins))
         self._listening = (
             clock.listenTCP(0, site, interface="127.0.0.1")
             if tls is None

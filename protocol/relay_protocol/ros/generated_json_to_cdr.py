@@ -19,6 +19,7 @@ from relay_protocol.limits import RELAY_FRAME
 from relay_protocol.ros.cdr_to_json import HEADER_BYTES
 from relay_protocol.ros.codegen import CodeGenerator, FunctionBuilder, TooLarge, UseSlowPath
 from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, Shape
+from relay_protocol.ros.json_to_cdr import widen
 from relay_protocol.ros.layout import LayoutTable
 from relay_protocol.ros.structs import StructFactory, is_stamp, is_time
 
@@ -259,7 +260,9 @@ class _WriterGenerator(CodeGenerator):
 
     def _wide_text(self, kind: FieldType, value: str) -> None:
         name = self.source.new_variable()
-        self.source.line(f"{name} = {self.source.constant(_wide_text)}({value}, {kind.bound or RELAY_FRAME})")
+        self.source.line(
+            f"{name} = {self.source.constant(_wide_text)}({value}, {kind.bound or RELAY_FRAME // 4})"
+        )
         self.add("I", 4, 4, f"len({name}) // 4")
         self._flush()
         self.source.line(f"out += {name}")
@@ -324,16 +327,15 @@ class _WriterGenerator(CodeGenerator):
 
 def _wide_text(text: str, bound: int) -> bytes:
     """Encode a wide string: UTF-16 units of 32 bits each (Fast DDS)."""
-    if "\0" in text:
+    # The slow path reports what is too long, before it is converted.
+    if "\0" in text or len(text) > bound:
         raise UseSlowPath
-    if not text.isascii() and max(text) > "\uffff":
-        pairs = text.encode("utf-16-le")
-        units = struct.pack(f"<{len(pairs) // 2}I", *struct.unpack(f"<{len(pairs) // 2}H", pairs))
-    else:
-        units = text.encode("utf-32-le")
-    if len(units) > 4 * bound:
+    if text.isascii():
+        return text.encode("utf-32-le")
+    units = text.encode("utf-16-le")
+    if len(units) > 2 * bound:
         raise UseSlowPath
-    return units
+    return widen(units)
 
 
 def _pack_bytes(value: Any) -> bytes:

@@ -36,7 +36,7 @@ _NUMBERS = {
     "d": frozenset({float, int}),
 }
 _INTEGER = frozenset({int})
-_NO_LINE_BREAKS = {ord("\r"): None, ord("\n"): None}
+_LINE_BREAKS = b"\r\n"
 _ZEROS = object()
 """Default of a fixed array of numbers, which may be long."""
 _KINDS = {
@@ -288,7 +288,7 @@ def _array_bytes(code: str, values: list[Any]) -> bytes:
 def _from_base64(text: str) -> bytes:
     try:
         # Some encoders break lines (RFC 2045 section 6.8), with CR LF or LF; nothing else beside the alphabet is taken.
-        return pybase64.b64decode(text.translate(_NO_LINE_BREAKS), validate=True)
+        return pybase64.b64decode(text.encode("ascii").translate(None, _LINE_BREAKS), validate=True)
     except ValueError:
         raise Mismatch("is a string that is not base64") from None
 
@@ -342,14 +342,26 @@ def _string(kind: FieldType) -> Write:
 def _wstring(kind: FieldType) -> Write:
     def write(out: bytearray, value: Any, now: int) -> None:
         body = _text(kind, value, "utf-16-le")
-        units = struct.unpack(f"<{len(body) // 2}H", body)
-        if kind.bound and len(units) > kind.bound:
-            raise Mismatch(f"must have at most {kind.bound} characters, not {len(units)}")
+        length = len(body) // 2
+        if kind.bound and length > kind.bound:
+            raise Mismatch(f"must have at most {kind.bound} characters, not {length}")
+        if 4 * length > RELAY_FRAME:
+            raise Mismatch(f"makes a message of more than {RELAY_FRAME} bytes")
         out += _PADDING[-len(out) & 3]
-        out += _U32(len(units))
-        out += struct.pack(f"<{len(units)}I", *units)
+        out += _U32(length)
+        out += widen(body)
 
     return write
+
+
+def widen(utf16: bytes) -> bytes:
+    """The units of a wide string, in 32 bits each.
+
+    :param utf16: little endian
+    """
+    units = bytearray(2 * len(utf16))
+    units[::4], units[1::4] = utf16[::2], utf16[1::2]
+    return bytes(units)
 
 
 def _text(kind: FieldType, value: Any, encoding: str) -> bytes:

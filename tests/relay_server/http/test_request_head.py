@@ -145,3 +145,57 @@ def test_an_invalid_handshake_gets_an_answer(world: World) -> None:
     for line in (b"Sec-WebSocket-Key: x", b"Origin: x", b"Sec-WebSocket-Protocol: a,a"):
         answered = answer(world, UPGRADE + line + b"\r\n\r\n")
         assert answered.status == 400
+
+
+@pytest.mark.parametrize("method", [b"GET", b"HEAD"])
+@pytest.mark.parametrize("path", [b"/\xe4", b"/api/v1/robots/\xc3\xa4?\xff", b"/robots/\x85"])
+def test_a_target_beyond_ascii_is_refused_without_a_traceback(
+    world: World, method: bytes, path: bytes
+) -> None:
+    refused = answer(world, method + b" " + path + b" HTTP/1.1\r\nHost: x\r\n\r\n")
+    assert refused.status == 400
+
+
+ABOUT = b'"product":"switchboard"'
+
+
+@pytest.mark.parametrize(
+    ("target", "status"),
+    [
+        (b"http://127.0.0.1:9090/robots/rover", 200),
+        (b"HTTPS://relay.example.org/robots/rover", 200),
+        (b"http://relay/healthz?x", 200),
+        (b"http://relay", 503),  # the portal, which is not built
+        (b"http://relay?x", 503),
+        (b"http://ann@relay/robots/rover", 400),
+        (b"http:///robots/rover", 400),
+        (b"http://relay/robots/rover#a", 400),
+        (b"ftp://relay/robots/rover", 400),
+        (b"http://" + b"a" * 400 + b"/robots/rover", 431),
+    ],
+)
+def test_a_target_in_absolute_form_is_read(world: World, target: bytes, status: int) -> None:
+    answered = answer(world, b"GET " + target + b" HTTP/1.1\r\nHost: another\r\n\r\n")
+    assert answered.status == status
+    if b"rover" in target:
+        assert (ABOUT in answered.body) == (status == 200)
+
+
+def test_the_host_of_a_target_in_absolute_form_counts_for_an_origin(world: World) -> None:
+    """An address of the relay is its own origin; a name in the field ``Host`` does not make it another one."""
+    head = b" HTTP/1.1\r\nHost: %b\r\nOrigin: http://127.0.0.1:9090\r\nContent-Type: application/json\r\n"
+    body = b'{"user":"ann","password":"correct horse"}'
+    rest = b"Content-Length: %d\r\n\r\n%b" % (len(body), body)
+    session = b"/api/v1/session"
+    assert answer(world, b"POST http://127.0.0.1:9090" + session + head % b"relay" + rest).status == 200
+    assert answer(world, b"POST http://relay" + session + head % b"127.0.0.1:9090" + rest).status == 403
+
+
+def test_a_handshake_in_absolute_form_opens_a_websocket(world: World) -> None:
+    whole = UPGRADE.replace(b"GET /", b"GET http://relay/")
+    assert answer(world, whole + b"\r\n").status == 101
+
+
+@pytest.mark.parametrize("line", [b"CONNECT relay:9090", b"GET robots/rover", b"GET *"])
+def test_other_forms_of_a_target_get_an_answer(world: World, line: bytes) -> None:
+    assert 400 <= answer(world, line + b" HTTP/1.1\r\nHost: x\r\n\r\n").status < 500

@@ -13,6 +13,7 @@ from relay_server.video import streams
 from tests.worlds.video_site import (
     CAMERA,
     CAMERAS,
+    PAGE,
     SECRET,
     SNAPSHOT,
     STREAM,
@@ -45,6 +46,8 @@ async def ticket(show: Show, camera: str = "", *, video: bool = True) -> str:
         (COOKIE | {"Sec-Fetch-Site": "same-site"}, 403),
         (COOKIE | {"Authorization": "Basic eDp5", "Sec-Fetch-Site": "cross-site"}, 403),
         ({"Authorization": "Bearer ann's", "Sec-Fetch-Site": "cross-site"}, 200),
+        (COOKIE | {"Sec-Fetch-Site": "same-site", "Origin": PAGE}, 200),
+        (COOKIE | {"Sec-Fetch-Site": "same-site", "Origin": f"{PAGE}:8443"}, 403),
     ],
 )
 @pytest_twisted.ensureDeferred
@@ -353,3 +356,27 @@ async def test_too_frequent_streams_are_refused_with_retry_after(
     show.shows(stream, jpeg())
     assert (await same.answer())[0] == 200
     first.leave()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_page_of_a_listed_origin_may_show_the_page_of_a_stream_in_a_frame(show: Show) -> None:
+    """That page alone: no other answer can be in a frame."""
+    path = STREAM.replace("/stream", "/stream_viewer")
+    status, headers, _ = await show.request(path).answer()
+    assert status == 200
+    assert f"frame-ancestors {PAGE}" in headers["content-security-policy"]
+    assert "'none'" not in headers["content-security-policy"].partition("frame-ancestors")[2]
+    assert "x-frame-options" not in headers
+    _, headers, _ = await show.request(CAMERAS).answer()
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert headers["x-frame-options"] == "DENY"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_page_of_a_listed_origin_may_read_the_answer_to_a_ticket(show: Show) -> None:
+    """For an image with the attribute ``crossorigin``, which a canvas can use."""
+    for origin, allowed in ((PAGE, PAGE), ("https://other.example", None)):
+        path = f"{CAMERAS}?ticket={await ticket(show)}"
+        status, headers, _ = await show.request(path, Authorization="", Origin=origin).answer()
+        assert status == 200
+        assert headers.get("access-control-allow-origin") == allowed

@@ -19,7 +19,10 @@ from relay_server.common import close_codes, websocket_frames
 from relay_server.http.limits import ConnectionLimits
 from relay_server.ws import bounded
 from relay_server.ws.connection import ClientConnection
+from relay_server.ws.updates import UpdatesFactory
 from tests.worlds.websocket_client import AUTH, Client, MemoryGate, Transport
+
+PAGES = "/api/v1/robots/stream"
 
 
 @pytest.fixture
@@ -360,17 +363,54 @@ def test_a_session_takes_and_sends_larger_messages(gate: MemoryGate) -> None:
 
 
 def test_handshake_and_proof_share_a_deadline(gate: MemoryGate) -> None:
-    """A hanging database must not hold a connection open; late answers open no session."""
-    gate.wait = Deferred()
-    client = Client(gate, Authorization="Bearer good")
+    client = Client(gate)
     client.clock.advance(limits.UNAUTHENTICATED_SECONDS - 0.1)
-    assert client.transport.connected
+    assert client.closed is None
     client.clock.advance(0.2)
+    client.run()
+    assert client.closed == close_codes.UNAUTHENTICATED
+
+
+@pytest.mark.parametrize("how", ["bearer", "ticket", "cookie", "page"])
+def test_a_handshake_while_the_database_hangs_gets_a_503(gate: MemoryGate, how: str) -> None:
+    """Before the connection's own deadline. A late answer of the database opens no session."""
+    gate.wait = Deferred()
+    origin = {"Origin": "http://relay:9090"}
+    client = {
+        "bearer": lambda: Client(gate, Authorization="Bearer good"),
+        "ticket": lambda: Client(gate, "/robots/rover?ticket=good"),
+        "cookie": lambda: Client(gate, Cookie="good", **origin),
+        "page": lambda: Client(gate, PAGES, factory=UpdatesFactory, Authorization="Bearer good"),
+    }[how]()
+    client.clock.advance(limits.UNAUTHENTICATED_SECONDS - 0.1)
+    client.run()
+    if how == "cookie":
+        # Browsers read no status of a handshake.
+        assert (client.status, client.closed) == (101, close_codes.UNAVAILABLE)
+    else:
+        assert client.status == 503
     assert not client.transport.connected
     gate.wait.callback(None)
     assert not gate.sessions
     assert gate.admitted == 0
     assert not client.clock.getDelayedCalls()
+
+
+@pytest.mark.parametrize("seconds", [0.0, limits.UNAUTHENTICATED_SECONDS - 1])
+def test_a_proof_by_message_while_the_database_hangs_is_not_a_wrong_one(
+    gate: MemoryGate, seconds: float
+) -> None:
+    """However late it comes: the client need not log in again."""
+    gate.wait = Deferred()
+    client = Client(gate)
+    client.clock.advance(seconds)
+    client.says(AUTH)
+    client.clock.advance(limits.UNAUTHENTICATED_SECONDS - seconds)
+    client.run()
+    assert client.closed == close_codes.UNAVAILABLE
+    gate.wait.callback(None)
+    assert not gate.sessions
+    assert gate.admitted == 0
 
 
 def test_a_second_handshake_while_the_first_waits_is_cut(gate: MemoryGate) -> None:
