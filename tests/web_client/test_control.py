@@ -262,8 +262,10 @@ class TestStop:
         expect(seen(page, "link-late")).to_be_visible()
         page.clock.install()
         seen(page, "stop").click()
-        expect(seen(page, "drive-words")).to_have_text("Stopping…")
-        expect(seen(page, "stop")).to_have_text("Stopping…")
+        expect(seen(page, "drive-words")).to_have_text(
+            re.compile("^(Stopping…|The stop is not confirmed yet.*)$")
+        )
+        expect(seen(page, "stop")).to_have_text(re.compile("^(Stopping…|Not confirmed)$"))
         page.clock.fast_forward(23_000)
         expect(seen(page, "drive-words")).to_contain_text("The stop is not confirmed.")
         expect(seen(page, "toast")).to_contain_text("The stop is not confirmed.")

@@ -86,9 +86,8 @@ async def test_stop_in_the_middle_of_a_slow_resume_has_the_last_word(tmp_path: P
     """The switch is set at once, and again when the resume's program has ended; only then the stop is done."""
     out = tmp_path / "out"
     note = "import pathlib, sys; out = pathlib.Path(sys.argv[1]); out.open('a').write('s')"
-    slow = (
-        "import pathlib, sys, time\nout = pathlib.Path(sys.argv[1])\nwhile not out.exists(): time.sleep(0.01)"
-    )
+    slow = "import pathlib, sys, time\nout = pathlib.Path(sys.argv[1])"
+    slow += "\nwhile not (out.exists() and out.read_text()): time.sleep(0.01)"
     slow += "\nout.open('a').write('r')"
     stop, resume = ([PYTHON, "-c", code, str(out)] for code in (note, slow))
     switch = Hardware(Switches("", stop, resume), MemoryPlatform(), TimelessPrograms())
