@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
+from relay_protocol.command_output import OutputGroup
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError
 from relay_protocol.identity import check_robot_name
 from relay_protocol.realms import split_name
@@ -68,7 +69,11 @@ def report_errors(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]}, epilog=examples(_ENROLL[0], _RUN[0]))
+@click.group(
+    cls=OutputGroup,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=examples(_ENROLL[0], _RUN[0]),
+)
 @click.version_option(package_name="robot-switchboard", message="%(version)s")
 def main() -> None:
     """Connect this robot to a Switchboard relay."""

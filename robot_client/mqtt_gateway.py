@@ -18,6 +18,7 @@ from typing import Any
 import click
 from msgspec.structs import replace
 
+from relay_protocol.command_output import OutputCommand
 from relay_protocol.errors import Invalid, Unavailable
 from robot_client import config, logs
 from robot_client.apps.connection import access_token
@@ -92,7 +93,9 @@ def build_platform(
     return MqttPlatform(mqtt, broker, DeviceNames(state / NAMES), reactor)
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]}, epilog=examples(*_RUN))
+@click.command(
+    cls=OutputCommand, context_settings={"help_option_names": ["-h", "--help"]}, epilog=examples(*_RUN)
+)
 @click.version_option(package_name="robot-switchboard", message="%(version)s")
 @click.option(
     "--state",

@@ -90,7 +90,7 @@ _DEFAULT_DATA = Path("~/.local/share/switchboard")
     default=_DEFAULT_DATA,
     show_default=True,
     show_envvar=True,
-    help="Folder with the database and the relay's keys.",
+    help="Folder with the database and the relay's keys. --data and --db may also stand behind a command.",
 )
 @click.option(
     "--db",

@@ -22,6 +22,7 @@ from relay_db.engine import Database
 from relay_db.names import normal_name, normalise
 from relay_db.queries import GroupRecord, RobotRecord, UserRecord
 from relay_db.queries.realms import realm_id
+from relay_protocol.command_output import OutputGroup
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.realms import DEFAULT_REALM, split_name
 from relay_protocol.scopes import Scope
@@ -58,11 +59,11 @@ class App:
 
     def __init__(self, data: Path, database_url: str | None = None) -> None:
         self.data = data
-        self._url = database_url
+        self.given_url = database_url
 
     @property
     def database_url(self) -> str:
-        return self._url or f"sqlite:///{self.data.absolute() / 'switchboard.db'}"
+        return self.given_url or f"sqlite:///{self.data.absolute() / 'switchboard.db'}"
 
     @contextmanager
     def database(self) -> Iterator[Database]:
@@ -295,9 +296,41 @@ class CommandEntry(NamedTuple):
     help: str
 
 
-class LazyGroup(click.Group):
-    """:param entries: commands by name, in the order of the help; entries whose module does not exist are
-    left out"""
+def _add_shared_options(command: click.Command) -> None:
+    """Let ``--data`` and ``--db`` stand behind a command too, unless it has an option of that name."""
+    if isinstance(command, click.Group):
+        for each in command.commands.values():
+            _add_shared_options(each)
+        return
+    own = {name for parameter in command.params for name in parameter.opts}
+    for option in _shared_options():
+        if own.isdisjoint(option.opts):
+            command.params.append(option)
+
+
+def _shared_options() -> Iterator[click.Option]:
+    def set_data(context: click.Context, _option: click.Parameter, data: Path | None) -> None:
+        app = context.find_object(App)
+        if data is not None and app is not None:
+            app.data = data.expanduser()
+
+    def set_database(context: click.Context, _option: click.Parameter, url: str | None) -> None:
+        app = context.find_object(App)
+        if url is not None and app is not None:
+            app.given_url = url
+
+    folder = click.Path(file_okay=False, path_type=Path)
+    # The help of the command as a whole has them.
+    yield click.Option(["--data"], type=folder, callback=set_data, expose_value=False, hidden=True)
+    yield click.Option(["--db"], callback=set_database, expose_value=False, hidden=True)
+
+
+class LazyGroup(OutputGroup):
+    """The options of the group may also stand behind a command.
+
+    :param entries: commands by name, in the order of the help; entries whose module does not exist are
+        left out
+    """
 
     def __init__(self, *args: Any, entries: Mapping[str, CommandEntry], **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -312,6 +345,7 @@ class LazyGroup(click.Group):
             return None
         command = getattr(import_module(entry.module), entry.name)
         assert isinstance(command, click.Command)
+        _add_shared_options(command)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import click
 
 from relay_protocol.clocks import now as seconds_since_boot
+from relay_protocol.command_output import OutputCommand
 from robot_client.apps.connection import (
     LivenessMonitor,
     Refused,
@@ -304,7 +305,7 @@ class AvoidanceProgram:
         self._wanted = wanted
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=OutputCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("url")
 @click.option("--scan", default="/scan", show_default=True, help="Topic of the scanner.")
 @click.option("--command", default="/cmd_vel", show_default=True, help="Topic of the commands.")

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import click
 
 from relay_protocol.clocks import now as seconds_since_boot
+from relay_protocol.command_output import OutputCommand
 from robot_client.apps.connection import LivenessMonitor, RosbridgeConnection, access_token, errors_as_click
 from robot_client.apps.event_client import EventClient, EventLogUnavailable
 from robot_client.apps.program import ExitSignal, StatusLine, run_connected
@@ -191,7 +192,7 @@ class Greeting:
         return f"greeted {person}"
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=OutputCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("url")
 @click.option(
     "--faces", default="/faces/seen", show_default=True, metavar="TOPIC", help="Topic of the service 'faces'."

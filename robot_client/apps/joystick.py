@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import click
 
 from relay_protocol.clocks import now as seconds_since_boot
+from relay_protocol.command_output import OutputCommand
 from robot_client.apps.connection import RosbridgeConnection, errors_as_click
 from robot_client.apps.driver import Driver, MaximumSpeeds, StopRequest, VelocityCommand
 from robot_client.apps.program import ExitSignal, StatusLine, driving, run_connected
@@ -417,7 +418,7 @@ def _layout(axes: tuple[int, int] | None, buttons: tuple[int, int, int] | None) 
     return ButtonLayout(ahead, left, hold, stop, back)
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=OutputCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @driving
 @click.option(
     "--dead",

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import click
 
 from relay_protocol.clocks import now as seconds_since_boot
+from relay_protocol.command_output import OutputCommand
 from robot_client.apps.connection import RosbridgeConnection, access_token, errors_as_click
 from robot_client.apps.driver import ZERO_VELOCITY, Driver, StopRequest, VelocityCommand
 from robot_client.apps.program import ExitSignal, StatusLine, driving, run_connected
@@ -465,7 +466,7 @@ class Recharge:
             self._driver.drive(command)
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=OutputCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @driving
 @click.option("--battery", default="/battery_state", show_default=True, metavar="TOPIC")
 @click.option(

@@ -21,6 +21,7 @@ from typing import NamedTuple, Protocol
 import click
 
 from relay_protocol.clocks import now as seconds_since_boot
+from relay_protocol.command_output import OutputCommand
 from robot_client.apps import audio
 from robot_client.apps.command_words import MOTION_WORDS, SECONDS, CommandWord, WordCommands
 from robot_client.apps.connection import RosbridgeConnection, access_token, errors_as_click
@@ -248,7 +249,7 @@ class VoiceControl:
         self._moving = command is not None
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=OutputCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @driving
 @click.option(
     "--wav",

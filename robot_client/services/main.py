@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from relay_protocol.command_output import OutputGroup
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.text import escape_unprintable
 from robot_client.command_line import Number, examples
@@ -56,6 +57,7 @@ COMMAND = "switchboard-robot-service"
 
 
 @click.group(
+    cls=OutputGroup,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=examples(f"{COMMAND} obstacles --scan /scan", f"{COMMAND} battery --topic /battery_state"),
 )

@@ -14,6 +14,7 @@ from typing import IO, Any, NamedTuple
 
 import click
 
+from relay_protocol.command_output import OutputCommand
 from relay_protocol.errors import Invalid
 from robot_client.command_line import Number, examples
 from robot_client.ros_log import ensure_log_folder
@@ -45,6 +46,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 @click.command(
+    cls=OutputCommand,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=examples(
         "switchboard-sim",

@@ -1,0 +1,63 @@
+"""Output of command lines: on any terminal, to a full disk and to a closed pipe."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import click
+
+FAILED = 1
+"""The exit code when the output cannot be written."""
+
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+
+
+class OutputCommand(click.Command):
+    """A command that replaces characters its terminal lacks, and reports output that cannot be written."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """See :meth:`click.Command.main`."""
+        with _written_output():
+            return super().main(*args, **kwargs)
+
+
+class OutputGroup(OutputCommand, click.Group):
+    """A group of commands with the same output; its commands need nothing of it themselves."""
+
+
+@contextlib.contextmanager
+def _written_output() -> Iterator[None]:
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace" if stream is sys.stdout else "backslashreplace")
+    try:
+        try:
+            yield
+        finally:
+            # At the end of the interpreter an error would be a traceback.
+            sys.stdout.flush()
+    except BrokenPipeError:
+        _discard_output()
+        sys.exit(FAILED)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        _discard_output()
+        target = error.filename or "the output"
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"Error: {target} cannot be written: {error.strerror}\n")
+        sys.exit(FAILED)
+
+
+def _discard_output() -> None:
+    """What is left in the buffer goes nowhere, so that the end of the interpreter does not fail."""
+    with contextlib.suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
