@@ -115,6 +115,26 @@ def test_the_stream_has_one_jpeg_a_part(shown: Any) -> None:
     assert stamps == sorted(set(stamps))
 
 
+def test_a_token_for_one_camera_opens_it_again_and_again_until_it_is_revoked(shown: Any) -> None:
+    """As for a recorder with a fixed address; it opens no other camera, and no command."""
+    scope = f"view:{CAMERA}@rover"
+    made = shown.relay.cli(
+        "token", "create", "operator", "--scope", scope, "--ttl", "365d", "--label", "recorder"
+    )
+    token = made["token"]
+    for _ in range(2):
+        with contextlib.closing(Mjpeg(shown.relay, token, width=320)) as viewer:
+            assert viewer.part() is not None
+    other = ask(
+        shown.relay.http_port, "GET", "/robots/rover/video/snapshot?topic=/depth/image_raw", token=token
+    )
+    assert other.status in (403, 404)
+    drive = ask(shown.relay.http_port, "PUT", "/api/v1/robots/rover/control", {}, token=token)
+    assert drive.status in (403, 404)
+    shown.relay.cli("token", "revoke", str(made["id"]))
+    assert get(shown.relay, token, "snapshot").status == 401
+
+
 def opencv(address: str) -> Iterator[Any]:
     """The frames of an address, read by OpenCV's ffmpeg."""
     capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG)
