@@ -1,5 +1,5 @@
 # The commands people and CI use. Everything lives in .venv; nothing is installed outside, except what apt brings
-# when run as root (python3-venv, gcc, curl, systemd, chromium-headless-shell, mosquitto; haproxy for bench).
+# when run as root (python3-venv, gcc, curl, systemd, chromium-headless-shell, mosquitto, pgbouncer; haproxy for bench).
 BIN := .venv/bin
 # ROS 2 would write its logs into the home directory, and not start without one.
 export ROS_LOG_DIR ?= $(CURDIR)/build/ros-log

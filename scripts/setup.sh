@@ -263,16 +263,20 @@ stage_browser() {
     fi
 }
 
-# --- A broker for the tests of MQTT devices; they start it themselves -------------------------------------------------
+# --- Servers for the tests of MQTT devices and of PgBouncer; they start them themselves --------------------------------
 
-find_broker() { PATH="$PATH:/usr/sbin" command -v mosquitto; }
+find_server() { PATH="$PATH:/usr/sbin" command -v "$1"; }
 
 stage_broker() {
-    find_broker >/dev/null && return
+    local missing=() package
+    for package in mosquitto pgbouncer; do
+        find_server "$package" >/dev/null || missing+=("$package")
+    done
+    [ ${#missing[@]} = 0 ] && return
     if ! can_apt; then
-        say "no Mosquitto: the tests of MQTT devices will fail until there is one (Debian: apt install mosquitto)"
-    elif ! apt_install mosquitto; then
-        say "Mosquitto could not be installed: the tests of MQTT devices will fail until there is one"
+        say "no ${missing[*]}: the tests that need it will fail until there is (Debian: apt install ${missing[*]})"
+    elif ! apt_install "${missing[@]}"; then
+        say "${missing[*]} could not be installed: the tests that need it will fail until it is"
     fi
 }
 
