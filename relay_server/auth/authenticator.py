@@ -256,7 +256,8 @@ def session_token(origins: Origins, name: str, header: str, origin: str | None, 
     :raises Refused: a cookie without a listed Origin
     :raises BadCredentials: the relay's own page sent none
     """
-    token = _cookie(header, name)
+    given = (_cookie(header, each) for each in origins.cookie_names(name, host))
+    token = next((each for each in given if each is not None), None)
     if token is None:
         if origin is not None and origin == f"{'https' if origins.tls else 'http'}://{host}":
             raise BadCredentials("your session has ended; log in again")
