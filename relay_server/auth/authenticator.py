@@ -120,12 +120,13 @@ class Authenticator:
     async def password(self, user: str, password: str, address: str) -> LoginResult:
         """Check a password. Unknown users take as long as known ones.
 
-        :param user: ``toad@lab1``; a name without a realm belongs to the default realm
+        :param user: ``toad@lab1``; a name without a realm belongs to the default realm. Blanks around it do not count
         :param address: of the client, for the limit on failures
         :raises BadCredentials: unknown user, wrong password or disabled account, with the same message
         :raises TooManyTries: decided before the password is hashed
         :raises Unavailable: the database does not answer, or too many users log in at once
         """
+        user = user.strip()
         wait = self._limiter.wait(user, address)
         if wait > 0:
             raise TooManyTries(wait)
@@ -255,7 +256,8 @@ def session_token(origins: Origins, name: str, header: str, origin: str | None, 
     :raises Refused: a cookie without a listed Origin
     :raises BadCredentials: the relay's own page sent none
     """
-    token = _cookie(header, name)
+    given = (_cookie(header, each) for each in origins.cookie_names(name, host))
+    token = next((each for each in given if each is not None), None)
     if token is None:
         if origin is not None and origin == f"{'https' if origins.tls else 'http'}://{host}":
             raise BadCredentials("your session has ended; log in again")

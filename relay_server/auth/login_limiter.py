@@ -48,13 +48,14 @@ def network_of(address: str) -> str:
 
 
 def person(account: str) -> str:
-    """The key of a user's account, however the name is written."""
+    """The key of a user's account, however the name is written. Names that no account can have share no key."""
     name, realm = split_name(account)
-    return f"{normalise(name)}@{normalise(realm)}"
+    normal = normalise(name), normalise(realm)
+    return "@".join(normal) if all(normal) else digest(account)
 
 
-def robot(claimed: str) -> str:
-    """The key of a robot's claimed name, of bounded length; different texts have different keys."""
+def digest(claimed: str) -> str:
+    """A key of bounded length for any claimed name; different texts have different keys."""
     return hashlib.sha256(claimed.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -67,7 +68,7 @@ class LoginLimiter:
 
     :param seconds: a monotonic clock
     :param of_network: failures of one network on all accounts together, if not :data:`FAILURES_OF_NETWORK`
-    :param known_as: makes the key of an account: :func:`person` or :func:`robot`
+    :param known_as: makes the key of an account: :func:`person` or :func:`digest`
     """
 
     def __init__(

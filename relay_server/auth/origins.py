@@ -53,6 +53,28 @@ class Origins:
         """Whether a browser that sent this ``Host`` uses TLS: the relay does, or the proxy of a listed origin."""
         return self.tls or _parse(f"https://{host}") in self._listed
 
+    @property
+    def any_encrypted(self) -> bool:
+        """Whether browsers may use TLS: the relay does, or the proxy of a listed origin."""
+        return self.tls or any(each.scheme == "https" for each in self._listed)
+
+    def cookie_name(self, name: str, encrypted: bool) -> str:
+        """The name under which a cookie is set.
+
+        A browser stores one with the prefix only over TLS, for this host alone, so no other host of the same domain
+        can set it.
+        """
+        return f"__Host-{name}" if encrypted else name
+
+    def cookie_names(self, name: str, host: str) -> tuple[str, ...]:
+        """The names under which a cookie counts that came with this ``Host``; the first that is there.
+
+        A proxy may send another ``Host`` than the browser. So the prefix counts everywhere, and a cookie without it
+        where the browser is not known to use TLS.
+        """
+        prefixed = self.cookie_name(name, True)
+        return (prefixed,) if self.encrypted(host) else (prefixed, name)
+
     def check(self, origin: str | None, host: str) -> None:
         """Check a cookie that came with this ``Origin`` and ``Host``.
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import re
+from collections.abc import Iterable
 
 from werkzeug.http import parse_etags
 
@@ -25,10 +27,31 @@ def weak(etag: str) -> str:
     return f"W/{etag}"
 
 
+_COMPRESSED = re.compile(r"(?:--?|;)(?:gzip|deflate|br|zstd)\Z")
+"""What proxies that compress an answer append to its tag: Apache, Caddy, Jetty and others."""
+
+
+def as_given(tags: Iterable[str]) -> frozenset[str]:
+    """Tags of a request, also as the relay gave them to a proxy that compresses.
+
+    :param tags: without ``W/`` and quotation marks
+    """
+    return frozenset(form for each in tags for form in (each, _COMPRESSED.sub("", each)))
+
+
+def names(header: str, etag: str) -> bool:
+    """Whether ``If-Match`` or ``If-None-Match`` names a state by its tag.
+
+    Weak tags count too: proxies that compress make strong ones weak, and the relay compares whole states.
+    """
+    tags = parse_etags(header)
+    return tags.star_tag or etag.removeprefix("W/").strip('"') in as_given(tags.as_set(include_weak=True))
+
+
 def check_match(etag: str, match: str) -> None:
     """Check that a state is one of those in ``If-Match`` (RFC 9110 section 13.1.1).
 
     :raises PreconditionFailed: it does not
     """
-    if not parse_etags(match).contains(etag.strip('"')):
+    if not names(match, etag):
         raise PreconditionFailed("it has changed since you read it; read it again")

@@ -69,7 +69,7 @@ class RequestAuthenticator:
         token = _bearer(request)
         if token is not None:
             return await prove(token)
-        cookie = request.getCookie(self._cookie.encode())
+        cookie = self._session(request)
         if cookie is None:
             raise BadCredentials(
                 "log in first: send an access token (Authorization: Bearer …) or a session cookie"
@@ -78,11 +78,16 @@ class RequestAuthenticator:
             self.origins.check(request.getHeader("origin"), request.getHeader("host") or "")
         return await prove(cookie.decode("ascii", "replace"))
 
+    def _session(self, request: Request) -> bytes | None:
+        names = self.origins.cookie_names(self._cookie, request.getHeader("host") or "")
+        given = (request.getCookie(each.encode()) for each in names)
+        return next((each for each in given if each is not None), None)
+
     def remembers(self, request: Request) -> bool:
         """Whether the token or cookie of a request was proved before. The database is not asked."""
         token = _bearer(request)
         if token is None:
-            token = (request.getCookie(self._cookie.encode()) or b"").decode("ascii", "replace")
+            token = (self._session(request) or b"").decode("ascii", "replace")
         return self._tokens.remembers(token)
 
     def check_origin(self, request: Request) -> None:
@@ -100,15 +105,24 @@ class RequestAuthenticator:
 
     def set_cookie(self, request: Request, token: str, seconds: float) -> None:
         """Set the session cookie in the answer; 0 seconds removes it."""
+        encrypted = self._is_encrypted(request)
         request.addCookie(
-            self._cookie,
+            self.origins.cookie_name(self._cookie, encrypted),
             token,
             path="/",
             max_age=str(int(seconds)),
             httpOnly=True,
-            secure=self.origins.encrypted(request.getHeader("host") or ""),
+            secure=encrypted,
             sameSite="strict",
         )
+
+    def _is_encrypted(self, request: Request) -> bool:
+        """Whether the browser uses TLS: by ``Host``, or by the origin of the portal if a proxy changes that."""
+        if self.origins.encrypted(request.getHeader("host") or ""):
+            return True
+        origin = request.getHeader("origin") or ""
+        own = request.getHeader("sec-fetch-site") == "same-origin"
+        return own and origin.lower().startswith("https:") and self.origins.is_listed(origin)
 
 
 def _bearer(request: Request) -> str | None:

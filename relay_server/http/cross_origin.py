@@ -69,6 +69,7 @@ class CrossOrigin:
 
     def __init__(self, origins: Origins) -> None:
         self._origins = origins
+        self.any_encrypted = origins.any_encrypted
         self._ancestors = " ".join(origins.listed).encode()
 
     def allow(self, request: Request) -> bool:

@@ -9,6 +9,7 @@ from werkzeug.datastructures import MIMEAccept
 from werkzeug.http import parse_accept_header, parse_etags
 
 from relay_protocol.errors import Invalid
+from relay_server.common.etags import as_given
 
 
 class MediaType(NamedTuple):
@@ -107,8 +108,8 @@ def sent(content_type: str | None, there: Sequence[MediaType] = FORMS) -> MediaT
 
 
 def tags_of(header: str | None) -> frozenset[str]:
-    """The entity tags that ``If-None-Match`` names."""
-    return frozenset(f'"{each}"' for each in parse_etags(header).as_set(include_weak=True))
+    """The entity tags that ``If-None-Match`` or ``If-Match`` names."""
+    return frozenset(f'"{each}"' for each in as_given(parse_etags(header).as_set(include_weak=True)))
 
 
 def of_any_form(header: str | None) -> str | None:
@@ -118,8 +119,7 @@ def of_any_form(header: str | None) -> str | None:
     named = parse_etags(header)
     if named.star_tag:
         return header
-    # Weak tags never match (RFC 9110 section 13.1.1).
-    tags = frozenset(f'"{each}"' for each in named.as_set())
+    tags = tags_of(header)
     return ", ".join(sorted(frozenset[str]().union(*(each.bases(tags) for each in FORMS)))) or '""'
 
 

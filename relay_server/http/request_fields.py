@@ -10,6 +10,7 @@ from werkzeug.http import parse_dict_header, parse_etags
 
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import NAME_BYTES
+from relay_server.common.etags import as_given
 from relay_server.http.limits import extend_time_limit
 from relay_server.http.media_types import EVENTS, JSON, preferred
 from relay_server.http.openapi.operation import header
@@ -200,7 +201,7 @@ def field(request: Request, name: str) -> str | None:
 def if_none_match(request: Request) -> frozenset[str]:
     """The entity tags of states that the client has (``If-None-Match``)."""
     tags = parse_etags(field(request, "if-none-match"))
-    return frozenset(f'"{each}"' for each in tags.as_set(include_weak=True))
+    return frozenset(f'"{each}"' for each in as_given(tags.as_set(include_weak=True)))
 
 
 def wait_preferred(request: Request, least: float = 0.0) -> float | None:

@@ -513,7 +513,8 @@ class RelaySite(Site):
         self.cross_origin = cross_origin
         self.large_bodies = LargeBodyLimits()
         self._headers = dict(SECURITY_HEADERS)
-        if tls:
+        # Behind a proxy that ends TLS, too. Browsers ignore it where they do not use TLS.
+        if tls or (cross_origin is not None and cross_origin.any_encrypted):
             self._headers[b"strict-transport-security"] = HSTS
         self.displayTracebacks = False
 

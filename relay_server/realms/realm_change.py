@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 from sqlalchemy.orm import Session
-from werkzeug.http import parse_etags
 
 from relay_db import queries
 from relay_db.names import normal_name
@@ -14,7 +13,7 @@ from relay_db.queries import GroupRecord, QuotaExceeded, RobotGroupRecord, Robot
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_server.access import BadCredentials, Principal
-from relay_server.common.etags import PreconditionFailed, check_match, tag_of
+from relay_server.common.etags import PreconditionFailed, check_match, names, tag_of
 from relay_server.realms.changes import GROUP_MARK, AuditedChange, Holder
 from relay_server.realms.schemas import MAX_COUNTS, MAX_PATTERNS, MAX_PATTERNS_OF_A_ROBOT
 
@@ -46,11 +45,7 @@ class Precondition(NamedTuple):
             raise PreconditionFailed("it no longer exists; read it again")
         if self.match is not None:
             check_match(etag, self.match)
-        if (
-            self.none is not None
-            and current is not None
-            and parse_etags(self.none).contains_weak(etag.strip('"'))
-        ):
+        if self.none is not None and current is not None and names(self.none, etag):
             raise PreconditionFailed("it exists by now; read it")
 
 

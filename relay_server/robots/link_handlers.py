@@ -92,7 +92,7 @@ class RobotLinkContext:
     failures: LoginLimiter = field(init=False)
 
     def __post_init__(self) -> None:
-        failures = LoginLimiter(self.seconds, FAILURES_OF_NETWORK, login_limiter.robot)
+        failures = LoginLimiter(self.seconds, FAILURES_OF_NETWORK, login_limiter.digest)
         object.__setattr__(self, "failures", failures)
 
 

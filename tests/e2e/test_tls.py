@@ -174,6 +174,7 @@ def test_pages_and_websockets_come_over_tls(world: World) -> None:
     login = ask(port, "POST", "/api/v1/session", body, headers=origin, tls=world.context)
     assert login.status == 200
     assert "secure" in login.headers["Set-Cookie"].lower()
+    assert login.cookie.startswith("__Host-switchboard_")
     with world.client() as client:
         assert client.call("/relay/ping", {"robot": True})["result"]
 

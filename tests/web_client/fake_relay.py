@@ -18,6 +18,7 @@ import secrets
 import time
 import types
 from collections.abc import Callable
+from email.utils import formatdate
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -628,6 +629,7 @@ class Connection:
             f"Content-Length: {len(data)}",
             f"Content-Type: {kind}",
             "Connection: close",
+            f"Date: {formatdate(usegmt=True)}",
         ]
         lines += [
             f"Content-Security-Policy: {CSP}",

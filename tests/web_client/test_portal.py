@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import itertools
 import re
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -60,6 +61,28 @@ class TestLogin:
         page.reload()
         expect(seen(page, "robot-card")).to_have_count(2)
 
+    def test_a_blank_around_the_name_does_not_count(self, open_page: OpenPage) -> None:
+        """Keyboards of phones add one."""
+        page = open_page("/")
+        seen(page, "login-user").fill(" driver ")
+        seen(page, "login-password").fill(PASSWORD)
+        seen(page, "login-submit").click()
+        expect(seen(page, "robot-card")).to_have_count(2)
+
+    @pytest.mark.parametrize("field", ["login-user", "login-password"])
+    def test_caps_lock_is_shown(self, open_page: OpenPage, field: str) -> None:
+        page = open_page("/")
+        expect(seen(page, field)).to_be_visible()
+        for on in (True, False):
+            event = {"key": "a", "bubbles": True, "modifierCapsLock": on}
+            seen(page, field).evaluate(
+                "(field, how) => field.dispatchEvent(new KeyboardEvent('keydown', how))", event
+            )
+            expect(seen(page, "caps-lock")).to_have_count(1 if on else 0)
+        # As the browser does when it fills a form in.
+        seen(page, field).evaluate("field => field.dispatchEvent(new Event('keydown', { bubbles: true }))")
+        expect(seen(page, "login-submit")).to_be_visible()
+
     def test_too_many_attempts_wait(self, open_page: OpenPage) -> None:
         """After 429 the button counts down the relay's time."""
         page = open_page("/login")
@@ -107,6 +130,18 @@ class TestFleet:
         expect(card).to_contain_text("76 %")
         expect(card).to_contain_text("owner")
 
+    @pytest.mark.parametrize("hours", [-5, 5])
+    def test_times_go_by_the_relays_clock(self, open_page: OpenPage, relay: FakeRelay, hours: int) -> None:
+        """The clock of the user's device may be wrong."""
+        page = open_page("/robots", user="admin")
+        page.add_init_script(
+            f"(() => {{ const now = Date.now; Date.now = () => now() + {hours} * 3600_000 }})()"
+        )
+        page.goto("/")
+        assert abs(page.evaluate("Date.now()") / 1000 - time.time()) > 3600
+        card = page.locator("[data-testid=robot-card][data-robot=arm-3]")
+        expect(card).to_contain_text("2 h ago")
+
     def test_changes_appear_by_themselves(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """A robot that goes offline is shown so without a reload."""
         page = open_page("/", user="admin")
@@ -142,7 +177,7 @@ class TestFleet:
     def test_text_from_robots_is_inert(self, open_page: OpenPage) -> None:
         """Markup in a robot's description is shown as text and makes no elements."""
         page = open_page("/", user="admin")
-        card = page.locator("[data-robot=rover-2]")
+        card = page.locator("[data-robot=arm-3]")
         expect(card).to_contain_text("<img src=x onerror=alert(1)>")
         assert card.locator("img, b").count() == 0
 

@@ -134,7 +134,10 @@ def document(operations: Iterable[ApiOperation], version: str, cookie: str) -> d
 
 
 def _schemes(cookie: str) -> dict[str, Any]:
-    session = "for browsers; requests that change anything need an `Origin` that the relay lists"
+    session = (
+        "for browsers; requests that change anything need an `Origin` that the relay lists. Over TLS its name has the "
+        "prefix `__Host-`"
+    )
     return {
         "token": {"type": "http", "scheme": "bearer", "description": "an access token"},
         "session": {"type": "apiKey", "in": "cookie", "name": cookie, "description": session},

@@ -80,6 +80,30 @@ async def test_the_right_password_names_its_user(auth: Authenticator, ann: UserR
 
 
 @pytest_twisted.ensureDeferred
+async def test_blanks_around_a_name_do_not_count(
+    auth: Authenticator, ann: UserRecord, quick_hash: None
+) -> None:
+    """Neither for the user nor for the limit."""
+    for name in (" ann", "ann ", "\tann@default\u00a0\n"):
+        assert (await auth.password(name, PASSWORD, HERE)).user_id == ann.id
+    for _ in range(login_limiter.FAILURES):
+        await words(auth.password("ann ", "wrong", HERE))
+    with pytest.raises(TooManyTries):
+        await auth.password("ann", PASSWORD, HERE)
+
+
+@pytest_twisted.ensureDeferred
+async def test_names_that_no_account_can_have_share_no_limit_over_all_networks(
+    auth: Authenticator, ann: UserRecord, quick_hash: None
+) -> None:
+    for number in range(FAILURES_OF_ACCOUNT):
+        await words(auth.password("a b", "wrong", f"198.51.100.{number}"))
+    with pytest.raises(TooManyTries):
+        await auth.password("a b", "wrong", HERE)
+    await words(auth.password("c d", "wrong", HERE))
+
+
+@pytest_twisted.ensureDeferred
 async def test_every_wrong_login_gets_the_same_answer(
     auth: Authenticator, store: AsyncDatabase, ann: UserRecord
 ) -> None:

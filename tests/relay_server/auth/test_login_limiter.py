@@ -48,6 +48,17 @@ def test_an_account_is_one_however_it_is_written(time: Time) -> None:
     assert limiter.wait("ann@Default", "192.0.2.1") > 0
 
 
+@pytest.mark.parametrize(
+    ("tried", "other"), [("a b", "c d"), ("ann@", "ann@ "), ("", "\0"), ("x" * 500, "x" * 501)]
+)
+def test_names_that_no_account_can_have_do_not_share_failures(time: Time, tried: str, other: str) -> None:
+    limiter = LoginLimiter(time)
+    for _ in range(FAILURES):
+        limiter.failed(tried, "192.0.2.1")
+    assert limiter.wait(tried, "192.0.2.1") > 0
+    assert limiter.wait(other, "192.0.2.1") == 0
+
+
 def test_accounts_of_two_realms_are_two(time: Time) -> None:
     """Guesses at one account lock no account of the same name in another realm."""
     limiter = exhausted(time)
@@ -60,7 +71,7 @@ def test_accounts_of_two_realms_are_two(time: Time) -> None:
 
 def test_a_robot_is_one_however_long_what_it_claims_is(time: Time) -> None:
     """A robot that claims another long name locks out no other robot."""
-    limiter = LoginLimiter(time, known_as=module.robot)
+    limiter = LoginLimiter(time, known_as=module.digest)
     first, second = (f"rover@lab#{key * 64}" for key in "ab")
     for _ in range(FAILURES):
         limiter.failed(first, "192.0.2.1")

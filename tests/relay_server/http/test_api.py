@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from relay_server.auth.authenticator import TicketPurpose
-from tests.worlds.http_client import ORIGIN, World
+from tests.worlds.http_client import HOST, ORIGIN, World
 
 SESSION = "/api/v1/session"
 COOKIE = {"Cookie": "sb=ann"}
@@ -38,10 +38,66 @@ def test_a_login_sets_a_cookie_that_is_for_this_site_alone(
     assert (answer.status, answer.json) == (200, {"user": "ann", "admin": False, "realm": "main"})
     (cookie,) = answer.cookies
     parts = cookie.lower().split("; ")
-    assert parts[0] == "sb=ann"
+    assert parts[0] == ("__host-sb=ann" if encrypted else "sb=ann")
+    assert not any(each.startswith("domain") for each in parts)
     assert {"httponly", "samesite=strict", "path=/", "max-age=43200"} <= set(parts)
     assert ("secure" in parts) is encrypted
     assert world.ask("POST", SESSION, {"code": "once"}).json["admin"] is True
+
+
+BEARER = {"Authorization": "Bearer ann"}
+PUBLIC = "https://robots.example"
+
+
+@pytest.mark.parametrize(
+    ("headers", "encrypted"),
+    [
+        ({"Origin": PUBLIC, "Sec-Fetch-Site": "same-origin"}, True),
+        ({"Origin": PUBLIC, "Sec-Fetch-Site": "cross-site"}, False),
+        ({"Origin": ORIGIN, "Sec-Fetch-Site": "same-origin"}, False),
+        ({}, False),
+    ],
+)
+def test_a_proxy_that_ends_tls_may_send_another_host(
+    tmp_path: Path, headers: dict[str, str], encrypted: bool
+) -> None:
+    """The origin of the portal's own page says that its browser uses TLS."""
+    world = World(tmp_path, listed=(PUBLIC,))
+    login = {"user": "ann", "password": "correct horse"}
+    (cookie,) = world.ask("POST", SESSION, login, **headers).cookies
+    assert cookie.startswith("__Host-sb=") is ("secure" in cookie.lower()) is encrypted
+    session = cookie.partition(";")[0]
+    assert world.ask("GET", SESSION, Cookie=session).status == 200
+    gone = world.ask("DELETE", SESSION, Cookie=session, **({"Origin": ORIGIN} | headers))
+    assert (gone.status, gone.cookies[0].partition("=")[0]) == (204, cookie.partition("=")[0])
+
+
+@pytest.mark.parametrize(("host", "status"), [("robots.example", 401), (HOST, 200)])
+def test_over_tls_a_cookie_without_the_prefix_does_not_count(tmp_path: Path, host: str, status: int) -> None:
+    """Another host of the same domain could have set it."""
+    world = World(tmp_path, listed=(PUBLIC,))
+    assert world.ask("GET", SESSION, Host=host, Cookie="sb=ann").status == status
+    assert world.ask("GET", SESSION, Host=host, Cookie="sb=wrong; __Host-sb=ann").status == 200
+    assert world.ask("GET", SESSION, Host=host, Cookie="__Host-sb=wrong; sb=ann").status == 401
+
+
+@pytest.mark.parametrize(("listed", "sent"), [((), False), ((ORIGIN,), False), ((ORIGIN, PUBLIC), True)])
+def test_behind_a_proxy_that_ends_tls_hsts_is_sent(
+    tmp_path: Path, listed: tuple[str, ...], sent: bool
+) -> None:
+    answer = World(tmp_path, listed=listed).ask("GET", "/")
+    assert ("strict-transport-security" in answer.headers) is sent
+
+
+@pytest.mark.parametrize("form", ["{}", "W/{}", "{}-gzip", "{}--gzip", "{}-br", "{};gzip", "W/{}-zstd"])
+def test_a_tag_that_a_compressing_proxy_changed_is_known(world: World, form: str) -> None:
+    tag = world.ask("GET", SESSION, **BEARER).headers["etag"]
+    before, _, after = form.partition("{}")
+    again = world.ask("GET", SESSION, If_None_Match=f'"x", {before}{tag[:-1]}{after}"', **BEARER)
+    assert again.status == 304
+    assert again.headers["etag"] == tag
+    other = world.ask("GET", SESSION, If_None_Match=f'{before}"x{after}"', **BEARER)
+    assert other.status == 200
 
 
 @pytest.mark.parametrize(

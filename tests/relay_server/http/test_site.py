@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import random
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 
 import pytest
@@ -348,3 +349,9 @@ def test_errors_of_the_relay_are_logged_with_their_traceback(
     reported(parse(transport.value()), status)
     assert b"insides" not in transport.value()
     assert any("log_failure" in each for each in logs) is (status == 500)
+
+
+def test_each_answer_has_the_relays_time(world: World) -> None:
+    """The portal shows times by it, also those of errors (RFC 9110 section 6.6.1)."""
+    for path in ("/api/v1/robots", "/healthz"):
+        assert parsedate_to_datetime(world.ask("GET", path).headers["date"]).timestamp() > 0

@@ -1,5 +1,6 @@
 /** Requests to the relay's HTTP API, typed by its OpenAPI document, and the errors they end with. */
 import { sentence } from '../format'
+import { learnRelayTime } from '../relayClock'
 import type { paths } from './schema'
 
 /** A request the relay refused, in its own words. */
@@ -65,6 +66,7 @@ export async function send<M extends Method, P extends Path<M>>(method: M, path:
   const sent: Record<string, string> = { ...HEADERS, ...headers }
   if (body !== undefined) sent['Content-Type'] = 'application/json'
   let response: Response
+  const sentMs = Date.now()
   try {
     response = await fetch(addressOf(path, names as object, query as object), {
       method: method.toUpperCase(),
@@ -76,6 +78,7 @@ export async function send<M extends Method, P extends Path<M>>(method: M, path:
   } catch {
     throw new Unreachable()
   }
+  learnRelayTime(response.headers.get('Date'), sentMs)
   if (!response.ok) throw await refusal(response)
   return response
 }

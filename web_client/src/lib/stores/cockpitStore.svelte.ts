@@ -11,6 +11,7 @@ import { recall, remember } from './storage'
 import { GRID, isCostmap, MOTION, ODOMETRY, ofType, PATH, pick, SCAN } from '../ros/topics'
 import type { Camera, Control, Robot } from '../api/types'
 import type { RelayStatus, TopicInfo } from '../ros/messages'
+import { relayTime } from '../relayClock'
 
 const TICK_MS = 33
 const TOPICS_MS = 5000
@@ -66,7 +67,7 @@ export class Cockpit implements Bridge {
   readonly statusStale = $derived(this.linkState !== 'open' || isStale(this.statusMs, this.nowMs, STATUS_STALE_MS))
   /** Why driving is not possible from this page, apart from control; null if it is. */
   readonly why = $derived(this.whyNot())
-  readonly unixS = $derived.by(() => (this.latency.clock.unixMs(this.nowMs) ?? Date.now()) / 1000)
+  readonly unixS = $derived.by(() => (this.latency.clock.unixMs(this.nowMs) ?? relayTime() * 1000) / 1000)
 
   readonly link: Link
   readonly controlStore: ControlStore

@@ -6,6 +6,7 @@ import { AlertBatch } from './alertBatching'
 import { notify } from './notifications'
 import { ALERTS } from '../route'
 import type { Alert, Robot } from '../api/types'
+import { relayTime } from '../relayClock'
 
 /** A shorter loss is not shown, milliseconds. */
 const LOSS_SHOWN_S = 1
@@ -70,7 +71,7 @@ class Watch {
   }
 
   private lose(msAgo: number, unknown: string | null): void {
-    this.lostSince ??= (Date.now() - msAgo) / 1000
+    this.lostSince ??= relayTime() - msAgo / 1000
     this.unknown = unknown
   }
 
