@@ -1,4 +1,8 @@
-"""Topics that clients publish to. Each is advertised once on the robot; JSON is converted to the robot's encoding."""
+"""Topics that clients publish to; JSON is converted to the robot's encoding.
+
+Each topic is advertised once on the robot for all its clients. A client that latches has a publisher of its own, as a
+node has, so that late subscribers get the last message of each such client.
+"""
 
 from __future__ import annotations
 
@@ -91,12 +95,16 @@ def unmatched_subscribers_text(nodes: list[str]) -> str:
 
 
 class RobotPublication:
-    """A topic that clients publish to, advertised once on the robot for all of them."""
+    """A publisher on the robot.
 
-    def __init__(self, number: int, topic: str, type_name: str) -> None:
+    :param owner: the client that latches and alone publishes by it; ``None``: all other clients of the topic do
+    """
+
+    def __init__(self, number: int, topic: str, type_name: str, owner: ClientMember | None) -> None:
         self.number = number
         self.topic = topic
         self.type = type_name
+        self.owner = owner
         self.latch = False
         self.queue_size = 0
         self.qos: QoS | None = None
@@ -143,7 +151,7 @@ class Publications:
         self._link_state = link_state
         self._definitions = definitions
         self._now_ns = now_ns
-        self._topics: dict[str, RobotPublication] = {}
+        self._topics: dict[str, list[RobotPublication]] = {}
         self._by_number: dict[int, RobotPublication] = {}
 
     def advertise(self, member: ClientMember, operation: rosbridge.Advertise, type_name: str) -> None:
@@ -161,11 +169,16 @@ class Publications:
         type_name: str,
         id: rosbridge.Id,
     ) -> RobotPublication:
-        publication = self._find_or_create(member, topic, type_name)
+        # Motion is never latched, and its clients share a publisher.
+        latched = _latches(operation) and not self._link_state.robot.is_motion(topic, type_name)
+        owner = member if latched else None
+        publication = self._find_or_create(member, topic, type_name, owner)
         unrequested = not publication.advertisers and publication.phase is RequestPhase.WAITING
         # The robot may have refused because of the earlier request's settings.
         if unrequested or publication.phase is RequestPhase.FAILED:
             _copy_settings(publication, operation)
+            if publication.advertisers.keys() <= {member}:
+                publication.owner = owner
         elif operation.latch != publication.latch or operation.qos not in (None, publication.qos):
             member.notify(
                 "warning", f"{topic} is advertised already; its first latch and qos stay", operation.id
@@ -183,11 +196,11 @@ class Publications:
         Its messages that wait are still sent. Send a warning if the topic was never advertised (rosbridge v2,
         Unadvertise).
         """
-        publication = self._topics.get(topic)
-        ids = publication.advertisers.get(member) if publication is not None else None
-        if publication is None or ids is None:
+        publication = self.find(topic, member)
+        if publication is None:
             member.notify("warning", f"unadvertise {topic}: you have not advertised it", id)
             return
+        ids = publication.advertisers[member]
         if id is not None and id not in ids:
             member.notify("warning", f"unadvertise {topic}: you have not advertised it with this id", id)
             return
@@ -198,7 +211,7 @@ class Publications:
 
     def forget(self, member: ChannelMember) -> None:
         """Withdraw all advertisements of a client, and drop its messages that wait."""
-        for publication in list(self._topics.values()):
+        for publication in list(self._by_number.values()):
             self._forget_on(publication, member)
 
     def _forget_on(self, publication: RobotPublication, member: ChannelMember) -> None:
@@ -210,7 +223,7 @@ class Publications:
 
     def forget_denied(self, member: ClientMember, permit: Permit) -> None:
         """Withdraw the advertisements that a client no longer has the right to, and drop its messages that wait."""
-        for publication in list(self._topics.values()):
+        for publication in list(self._by_number.values()):
             if publication.is_used_by(member.user):
                 decision = permit.decide(Operation.PUBLISH, publication.topic)
                 if not decision.allowed:
@@ -226,8 +239,8 @@ class Publications:
 
         :raises Invalid: the topic's type is unknown, or the topic has another type
         """
-        publication = self._topics.get(topic)
-        if publication is None or member not in publication.advertisers:
+        publication = self.find(topic, member)
+        if publication is None:
             wanted = type_name or self.known_type(topic)
             if not wanted:
                 raise Invalid(f"topic {topic} does not exist and no type was given; advertise it first")
@@ -238,20 +251,18 @@ class Publications:
         """Topics of a client that some nodes can't receive because of their quality of service, with these nodes."""
         return [
             (each.topic, each.unmatched)
-            for each in self._topics.values()
+            for each in self._by_number.values()
             if each.unmatched and member in each.advertisers
         ]
 
     def advertisers(self, topic: str) -> Collection[ClientMember]:
         """Clients that have advertised a topic."""
-        publication = self._topics.get(topic)
-        return () if publication is None else publication.advertisers.keys()
+        return [member for each in self._topics.get(topic, ()) for member in each.advertisers]
 
     def active(self) -> tuple[tuple[str, str], ...]:
         """Topics for which the robot has a publisher for the relay, with their types."""
-        return tuple(
-            (each.topic, each.type) for each in self._topics.values() if each.phase is RequestPhase.ACTIVE
-        )
+        active = (each for each in self._by_number.values() if each.phase is RequestPhase.ACTIVE)
+        return tuple(dict.fromkeys((each.topic, each.type) for each in active))
 
     def message_dropped(self, key: Hashable, source: int) -> None:
         """Count a message that was dropped in the queue to the robot, and notify its client, not too often.
@@ -279,7 +290,7 @@ class Publications:
 
     def dropped(self, member: ClientMember) -> list[tuple[str, int]]:
         """Messages of a client that were dropped in the queue to the robot: topic and count."""
-        found = ((each.topic, each.dropped.get(member.number)) for each in self._topics.values())
+        found = ((each.topic, each.dropped.get(member.number)) for each in self._by_number.values())
         return [(topic, dropped.count) for topic, dropped in found if dropped is not None]
 
     def publish(
@@ -349,8 +360,8 @@ class Publications:
     def _enqueue(self, publication: RobotPublication, message: QueuedMessage) -> None:
         mine = (
             len(each.body)
-            for topic in self._topics.values()
-            for each in topic.queued
+            for other in self._by_number.values()
+            for each in other.queued
             if each.member is message.member
         )
         # A single message is queued whatever its size.
@@ -363,9 +374,13 @@ class Publications:
             oldest = publication.queued.popleft()
             _notify_dropped(publication, oldest, "too much waits for the robot; the oldest was dropped")
 
-    def find(self, topic: str) -> RobotPublication | None:
-        """The publication of a topic, if clients have advertised it."""
-        return self._topics.get(topic)
+    def find(self, topic: str, member: ClientMember) -> RobotPublication | None:
+        """The publication by which a client publishes to a topic, if it has advertised it."""
+        return next((each for each in self._topics.get(topic, ()) if member in each.advertisers), None)
+
+    def is_motion(self, topic: str) -> bool:
+        """Whether the robot counts a topic that clients have advertised as motion."""
+        return any(each.motion for each in self._topics.get(topic, ()))
 
     def encoded_sender(self, publication: RobotPublication) -> SendMessage | None:
         """The function that sends CDR as it is; ``None``: none can be sent now, or the robot speaks JSON."""
@@ -379,7 +394,7 @@ class Publications:
 
     def graph_changed(self) -> None:
         """Try again to advertise topics whose entry in the graph has changed."""
-        for publication in list(self._topics.values()):
+        for publication in list(self._by_number.values()):
             self._try_again(publication)
 
     def _try_again(self, publication: RobotPublication) -> None:
@@ -389,12 +404,12 @@ class Publications:
 
     def opened(self) -> None:
         """Advertise all topics on a robot that has come online."""
-        for publication in list(self._topics.values()):
+        for publication in list(self._by_number.values()):
             self._advertise_on_robot(publication)
 
     def lost(self) -> None:
         """Handle that the robot is offline; queued messages are dropped as outdated."""
-        for publication in list(self._topics.values()):
+        for publication in list(self._by_number.values()):
             publication.enter(RequestPhase.WAITING)
             publication.unmatched = []
             queued = list(publication.queued)
@@ -405,7 +420,7 @@ class Publications:
 
     def type_known(self, type_name: str) -> None:
         """Send the messages that waited for a definition, and advertise again what failed without it."""
-        for publication in list(self._topics.values()):
+        for publication in list(self._by_number.values()):
             if publication.type != type_name:
                 continue
             if publication.phase is RequestPhase.FAILED:
@@ -452,39 +467,56 @@ class Publications:
 
     def type_failed(self, type_name: str, reason: str) -> None:
         """Handle that a type's definition is not available."""
-        for publication in list(self._topics.values()):
+        for publication in list(self._by_number.values()):
             if publication.type == type_name and publication.phase is not RequestPhase.WAITING:
                 self.refused(publication.number, reason)
 
     def known_type(self, topic: str) -> str:
         """The type of a topic that is published to, or is in the robot's graph; empty: unknown."""
-        publication = self._topics.get(topic)
+        published = self._topics.get(topic)
         return (
-            (publication.type if publication else None)
-            or self._link_state.robot.graph.topic_type(topic)
-            or ""
+            (published[0].type if published else None) or self._link_state.robot.graph.topic_type(topic) or ""
         )
 
     def _needs_type(self, publication: RobotPublication) -> bool:
         return not self._definitions.is_settled(publication.type)
 
-    def _find_or_create(self, member: ClientMember, topic: str, type_name: str) -> RobotPublication:
+    def _find_or_create(
+        self, member: ClientMember, topic: str, type_name: str, owner: ClientMember | None
+    ) -> RobotPublication:
         known = self.known_type(topic)
         if known and known != type_name:
             raise Invalid(f"topic {topic} has the type {known}, not {type_name or 'none'}")
         if not type_name:
             raise Invalid(f"topic {topic} does not exist; advertise it with its type")
-        if sum(len(each.advertisers.get(member, ())) for each in self._topics.values()) >= ADVERTISEMENTS:
+        if sum(len(each.advertisers.get(member, ())) for each in self._by_number.values()) >= ADVERTISEMENTS:
             raise Refused(f"at most {ADVERTISEMENTS} advertisements can be held on one connection")
-        publication = self._topics.get(topic)
+        publication = self._usable(member, topic, owner)
         if publication is None or member not in publication.advertisers:
-            mine = sum(each.is_used_by(member.user) for each in self._topics.values())
+            mine = sum(each.is_used_by(member.user) for each in self._by_number.values())
             if mine >= USER_TOPICS:
                 raise Refused(f"you advertise {USER_TOPICS} topics of this robot, the most one user may")
         if publication is None:
-            publication = RobotPublication(self._link_state.new_number(), topic, type_name)
-            self._topics[topic] = self._by_number[publication.number] = publication
+            publication = RobotPublication(self._link_state.new_number(), topic, type_name, owner)
+            self._topics.setdefault(topic, []).append(publication)
+            self._by_number[publication.number] = publication
         return publication
+
+    def _usable(
+        self, member: ClientMember, topic: str, owner: ClientMember | None
+    ) -> RobotPublication | None:
+        """The publication that a client has on a topic; else one that it can use.
+
+        :param owner: the client if it latches
+        """
+        found = self.find(topic, member)
+        if found is not None:
+            return found
+        for each in self._topics.get(topic, ()):
+            unrequested = not each.advertisers and each.phase is RequestPhase.WAITING
+            if each.owner is owner or (unrequested and all(other.member is member for other in each.queued)):
+                return each
+        return None
 
     def _advertise_on_robot(self, publication: RobotPublication) -> None:
         if self._link_state.link is None:
@@ -528,15 +560,23 @@ class Publications:
 
     def _end_if_unused(self, publication: RobotPublication) -> None:
         """End a publication that no client advertises and on which no message waits."""
-        is_known = self._topics.get(publication.topic) is publication
+        is_known = self._by_number.get(publication.number) is publication
         if publication.advertisers or publication.queued or not is_known:
             return
-        del self._topics[publication.topic]
+        others = self._topics[publication.topic]
+        others.remove(publication)
+        if not others:
+            del self._topics[publication.topic]
         del self._by_number[publication.number]
         self._link_state.names_in_use -= 1
         self._link_state.robot_requests.withdraw(("advertise", publication.number))
         if publication.phase in (RequestPhase.REQUESTED, RequestPhase.ACTIVE):
             self._link_state.send(link.Unadvertise(number=publication.number))
+
+
+def _latches(operation: rosbridge.Advertise | rosbridge.Publish) -> bool:
+    """Whether the last messages are kept for late subscribers."""
+    return operation.latch or (operation.qos is not None and operation.qos.durability == "transient_local")
 
 
 def _copy_settings(publication: RobotPublication, operation: rosbridge.Advertise | rosbridge.Publish) -> None:

@@ -200,8 +200,9 @@ class ClientPublications:
     def _moves(self, channel: ClientChannel) -> bool:
         """Whether messages move the robot, so that they must be judged one by one."""
         client = self._context.client
-        publication = client.channel.publications.find(channel.topic)
-        return client.robot.is_motion(channel.topic, channel.type) or bool(publication and publication.motion)
+        return client.robot.is_motion(channel.topic, channel.type) or client.channel.publications.is_motion(
+            channel.topic
+        )
 
     # --- the definition of the type -----------------------------------------------------------------------
 

@@ -396,7 +396,7 @@ class RunningPipe:
             raise Refused(
                 f"service {self._source_name} moves robot {source.name}, so it can't be a source with a rate"
             )
-        robot, publication = target.robot, target.channel.publications.find(self._target_name)
+        robot = target.robot
         if self._target_program is not None:
             self.moves = False
         elif self.settings.target.action:
@@ -404,9 +404,9 @@ class RunningPipe:
         elif self._caller is not None:
             self.moves = robot.description.motion.moves_by_service(self._target_name)
         else:
-            self.moves = robot.is_motion(self._target_name, target_type) or (
-                publication is not None and publication.motion
-            )
+            self.moves = robot.is_motion(
+                self._target_name, target_type
+            ) or target.channel.publications.is_motion(self._target_name)
         if not self.moves:
             return
         if not self._fresh and self._links is None:
@@ -516,12 +516,12 @@ class RunningPipe:
         """Advertise the target's topic; whether the robot publishes it now."""
         target = self._target.client
         publications = target.channel.publications
-        publication = publications.find(self._target_name)
-        if publication is None or target not in publication.advertisers:
+        publication = publications.find(self._target_name, target)
+        if publication is None:
             self._target.perform(
                 rosbridge.Advertise(id="pipe", topic=self._target_name, type=target_type, latch=False)
             )
-            publication = publications.find(self._target_name)
+            publication = publications.find(self._target_name, target)
         return publication is not None and publication.phase is RequestPhase.ACTIVE
 
     def _subscribe(self, source_type: str) -> None:

@@ -11,13 +11,14 @@ from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_protocol import link, rosbridge
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import Invalid, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_server.access import Permit, Principal, is_image_topic
 from relay_server.channels.channel import Channel
 from relay_server.channels.client_subscription import ClientSubscription
 from relay_server.channels.samples import Converter, Sample
 from relay_server.common.clock import Clock, Timer, cancel
+from relay_server.recordings.clock_jumps import ClockJumps
 from relay_server.recordings.library import RecordingEntry, RecordingState, why_denied
 from relay_server.recordings.mcap_file import McapChannel
 from relay_server.recordings.writer import RecordedMessage, RecordingWriter, WriteOutcome
@@ -81,6 +82,9 @@ clock is known. Further ones are dropped and counted."""
 
 PROBLEMS = 20
 """Most problems stored with a recording."""
+
+NAMED = 10
+"""Most topics that the problem of missing ones names."""
 
 STAMPS_END = 2**31 * 10**9
 """The first nanosecond that ``builtin_interfaces/Time`` cannot represent, in January 2038."""
@@ -156,6 +160,12 @@ class Recorder:
         self._tracks: dict[str, tuple[Converter, McapChannel]] = {}
         self._eyes = [CameraTap(clock, self, camera) for camera in entry.cameras]
         self._lost = 0
+        self._unsubscribed: set[str] = set()
+        """Topics that the robot does not have yet."""
+        self._missing = dict.fromkeys(entry.topics)
+        """Topics that the robot has not had so far, in their order."""
+        self._missing_problem = ""
+        self._jumps = ClockJumps(clock)
 
     @property
     def principal(self) -> Principal:
@@ -177,9 +187,7 @@ class Recorder:
         self._find_image_topics()
         try:
             for topic in self.entry.topics:
-                listener = TopicTap(self._clock, self, topic)
-                listener.add(rosbridge.Subscribe(topic=topic))
-                self._channel.subscriptions.add(self, listener, "", None)
+                self._subscribe(topic)
             for tap in self._eyes:
                 tap.open()
         except SwitchboardError:
@@ -187,12 +195,57 @@ class Recorder:
             raise
         self.permit.on_change = self._check_rights
         self.permit.on_revoke = lambda error: self.stop(str(error))
+        self._channel.robot_clock.on_jump.append(self._time_jumped)
         self._timer = self._clock.callLater(self.entry.seconds, self.stop, "its time is over")
         self._writer.start()
         self.recheck_rights()
 
+    def _subscribe(self, topic: str) -> None:
+        """Subscribe to a topic, or note that it is to be done when the robot has it.
+
+        :raises SwitchboardError: it can't be recorded
+        """
+        listener = TopicTap(self._clock, self, topic)
+        listener.add(rosbridge.Subscribe(topic=topic))
+        try:
+            self._channel.subscriptions.add(self, listener, "", None)
+        except Invalid:
+            if topic in self._channel.robot.graph.topics:
+                raise
+            self._unsubscribed.add(topic)
+        else:
+            self._unsubscribed.discard(topic)
+
+    def _subscribe_to_new(self) -> None:
+        """Subscribe to topics that the robot has now, and say which it still has not."""
+        there = self._channel.robot.graph.topics
+        for topic in sorted(self._unsubscribed & there.keys()):
+            try:
+                self._subscribe(topic)
+            except SwitchboardError as error:
+                self.notify("error", f"{topic}: {error}")
+        if self._channel.link_state.link is not None:
+            self._note_missing("do not exist yet, and are recorded when they come")
+
+    def _note_missing(self, words: str) -> None:
+        active = (topic for topic, _ in self._channel.subscriptions.active())
+        for topic in (*self._channel.robot.graph.topics, *active):
+            self._missing.pop(topic, None)
+        names = list(self._missing)
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        text = f"these topics {words}: {', '.join(names[:NAMED])}{more}" if names else ""
+        if text != self._missing_problem:
+            problems = self.entry.problems
+            if self._missing_problem in problems:
+                problems.remove(self._missing_problem)
+            self._missing_problem = text
+            if text:
+                self.notify("warning", text)
+
     def stop(self, reason: str) -> None:
         """Finish the file with the samples so far."""
+        if self.entry.state is RecordingState.RECORDING:
+            self._note_missing("did not exist while it was recorded")
         if self._handle(RecordingEvent.ENOUGH, reason):
             self._release()
             self._writer.finish()
@@ -224,6 +277,8 @@ class Recorder:
     def _release(self) -> None:
         cancel(self._timer)
         cancel(self._save_timer)
+        if self._time_jumped in self._channel.robot_clock.on_jump:
+            self._channel.robot_clock.on_jump.remove(self._time_jumped)
         self._lost += len(self._held)
         self._held.clear()
         for tap in self._eyes:
@@ -231,9 +286,11 @@ class Recorder:
         self._channel.detach(self)
 
     def recheck_rights(self) -> None:
-        """A topic may carry images that did not before."""
+        """A topic may carry images that did not before, or have come."""
         self._find_image_topics()
         self._check_rights()
+        if self.entry.state is RecordingState.RECORDING:
+            self._subscribe_to_new()
         self._save_topics()
 
     def _find_image_topics(self) -> None:
@@ -317,7 +374,20 @@ class Recorder:
 
     def deliver(self, subscription: ClientSubscription, sample: Sample) -> None:
         """A sample of a topic, as it comes."""
+        topic, stamp = subscription.topic, sample.ros_time_ns
+        # Samples of several publishers that latch may come in any order; a simulation's jumps are known.
+        if not self._simulated and 0 < stamp < STAMPS_END and not self._channel.subscriptions.latched(topic):
+            jump = self._jumps.seconds(topic, stamp)
+            if jump:
+                self._note_jump("the robot's clock", "back" if jump < 0 else "forward", abs(jump))
         self.keep(subscription.topic, sample, sample.ros_time_ns)
+
+    def _time_jumped(self) -> None:
+        self._note_jump("the robot's simulated time", "back")
+
+    def _note_jump(self, clock: str, direction: str, seconds: float = 0.0) -> None:
+        by = f" by {seconds:.0f} s" if seconds >= 1.0 else ""
+        self.notify("warning", f"{clock} jumped {direction}{by}; times before and after it do not compare")
 
     def keep(self, topic: str, sample: Sample, log_time: int) -> None:
         """Write a sample.

@@ -132,8 +132,8 @@ def parse_facts(facts: Mapping[str, str]) -> ChargeState:
         amperes = abs(amperes)
     now, full, design = (_ampere_hours(facts, each, volts) for each in ("now", "full", "full_design"))
     share = _number(facts, "capacity") / 100
-    if math.isnan(share):
-        share = _quotient(now, full)
+    if math.isnan(share) and full > 0:
+        share = min(1.0, max(0.0, now / full))  # an aged battery can hold more than it has learned
     return ChargeState(
         volts=volts,
         amperes=amperes,
@@ -141,7 +141,7 @@ def parse_facts(facts: Mapping[str, str]) -> ChargeState:
         charge=now,
         capacity=full,
         design=design,
-        share=share if math.isnan(share) else min(1.0, max(0.0, share)),
+        share=share,
         status=status,
         health=HEALTH.get(facts.get("health", ""), 0),
         technology=TECHNOLOGY.get(facts.get("technology", ""), 0),
@@ -195,6 +195,13 @@ class Gauge:
 
     def finding(self, state: ChargeState) -> ServiceFinding:
         """Diagnostics of a state."""
+        found = self._finding(state)
+        if math.isnan(state.share) or 0.0 <= state.share <= 1.0:
+            return found
+        words = f"it reports a charge of {state.share:g}, which is not from 0 to 1; {found.message}"
+        return found._replace(level=max(Level.WARN, found.level), message=words)
+
+    def _finding(self, state: ChargeState) -> ServiceFinding:
         share = self.share(state)
         values = _values(state, share)
         if not state.present:

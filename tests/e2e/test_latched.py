@@ -214,3 +214,24 @@ def test_latched_publisher_among_others(nodes: Speakers, clients: list[Client]) 
     for client in clients[:2]:
         assert texts(client, topic, 1) == ["passing"]
         assert rest(client, topic) == []
+
+
+def test_every_client_that_latches_has_its_last_one(
+    world: Any, nodes: Speakers, clients: list[Client]
+) -> None:
+    """As several nodes would: late nodes of the graph and late clients get one of each."""
+    topic = "/tf_static_of_clients"
+    with ExitStack() as stack:
+        for name in ("a", "b"):
+            client = stack.enter_context(world.relay.connect("rover", world.operator))
+            client.send(op="advertise", topic=topic, type=STRING, latch=True)
+            for number in range(2):
+                client.send(op="publish", topic=topic, msg={"data": f"{name}{number}"})
+        nodes.subscribe("early", topic, depth=10, durability="transient_local")
+        wait_for("the last of both", lambda: {"a1", "b1"} <= set(nodes.heard("early")))
+        nodes.subscribe("late", topic, depth=10, durability="transient_local")
+        wait_for("one of each", lambda: sorted(nodes.heard("late")) == ["a1", "b1"])
+        viewer = clients[0]
+        viewer.send(op="subscribe", topic=topic, type=STRING)
+        assert sorted(texts(viewer, topic, 2)) == ["a1", "b1"]
+        assert rest(viewer, topic) == []

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from relay_server.recordings.mcap_file import McapChannel
 
@@ -43,6 +45,23 @@ def read(path: Path) -> list[Read]:
             found.append(Read(channel.topic, schema.name, schema.encoding, schema.data, *times, message.data))
         assert summary.statistics.message_count == len(found)
         return found
+
+
+_ANY = "any_msgs/msg/Any"
+"""A name for any type: other readers refuse some names of services' and actions' messages, whatever the schema."""
+
+
+def value_by_rosbags(schema: bytes, body: bytes) -> Any:
+    """A message as rosbags decodes it by its schema."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema.decode(), _ANY))
+    return store.deserialize_cdr(body, _ANY)
+
+
+def value_by_mcap_ros2(schema: bytes, body: bytes) -> Any:
+    """A message as mcap-ros2-support decodes it by its schema."""
+    dynamic = pytest.importorskip("mcap_ros2._dynamic")
+    return dynamic.generate_dynamic(_ANY, schema.decode())[_ANY](body)
 
 
 def profile(path: Path) -> str:

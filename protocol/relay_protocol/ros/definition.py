@@ -134,6 +134,9 @@ _LINE = re.compile(
 )
 _QUOTED = re.compile(r"""[ \t]*(?:"((?:[^"\\]|\\.)*)"|'((?:[^'\\]|\\.)*)')[ \t]*""")
 _ITEM = re.compile(r"""(?:[ \t]*(?:"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')[ \t]*|[^,"']*)(?:,|\Z)""")
+_KIND = re.compile(r"/(?:msg|srv|action)/")
+_LONG_TYPE = re.compile(r"\A([ \t]*[A-Za-z][A-Za-z0-9_]*)/(?:msg|srv|action)/(?=[A-Za-z])")
+_HEADER_ALONE = re.compile(r"\A([ \t]*)Header(?=[ \t\[])")
 HEADER = "std_msgs/msg/Header"
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 _BUILT_IN = {
@@ -238,6 +241,9 @@ def _with_derived(type_name: str, definitions: dict[str, Definition]) -> dict[st
 def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) -> str:
     """The text of one message with all it contains and nothing else, in rosbag2's ``ros2msg`` layout.
 
+    Types are named ``package/Name``, as in .msg files, also those of services and actions: readers of MCAP refuse
+    longer names (mcap.dev/spec/registry, ``ros2msg``).
+
     :param name: a part of ``top``, or a message its text contains
     :param top: the type whose text it is
     :param definitions: what :func:`parse` made of it
@@ -252,11 +258,23 @@ def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) 
     while waiting:
         each = waiting.pop()
         if each not in found:
-            title = "" if each == name else f"{'=' * 80}\nMSG: {each.replace('/msg/', '/')}\n"
-            found[each] = title + "\n".join(bodies[each]).rstrip("\n") + "\n"
+            title = "" if each == name else f"{'=' * 80}\nMSG: {_KIND.sub('/', each)}\n"
+            own_header = f"{each.split('/')[0]}/msg/Header" in definitions
+            body = "\n".join(_with_short_type(line, own_header) for line in bodies[each])
+            found[each] = title + body.rstrip("\n") + "\n"
             kinds = (field.type for field in definitions[each].fields)
             waiting += reversed([kind.base for kind in kinds if kind.primitive is None])
     return "".join(found.values())
+
+
+def _with_short_type(line: str, own_header: bool) -> str:
+    """A line with its type as ``package/Name``.
+
+    :param own_header: whether the package has a ``Header``, see :func:`_full_name`
+    """
+    if not own_header:
+        line = _HEADER_ALONE.sub(r"\1std_msgs/Header", line)
+    return _LONG_TYPE.sub(r"\1/", line)
 
 
 def _parse_all(type_name: str, text: str) -> dict[str, Definition]:

@@ -1,12 +1,14 @@
 """The ROS 2 graph, read node by node, which is cheaper than by topic.
 
+Nodes with one full name are read by topic: by node, the middleware answers for one of them only.
+
 Hidden topics are included, since clients may subscribe to them by name; hidden nodes, services and actions
 are not.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -17,6 +19,10 @@ from robot_client.platforms.base import GraphView
 GOAL_TYPE = "_SendGoal"
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """Name of the node of an endpoint whose node is not discovered yet, or which has none."""
+
+
+_Services = dict[str, dict[str, set[str]]]
+"""Full names of the nodes that provide a service, by its name and type."""
 
 
 class _Topics(NamedTuple):
@@ -32,15 +38,20 @@ def read(node: Any, own: tuple[str, ...]) -> GraphView:
     :param own: prefixes of the full names of nodes that are left out, with everything that only they have
     """
     topics = _Topics(defaultdict(set), defaultdict(set), defaultdict(set))
-    services: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
-    nodes = set()
-    for name, namespace in node.get_node_names_and_namespaces():
+    services: _Services = defaultdict(lambda: defaultdict(set))
+    found = Counter(node.get_node_names_and_namespaces())
+    nodes, namesakes = set(), set()
+    for (name, namespace), count in found.items():
         full = full_name(name, namespace)
         if full.startswith(own) or name == UNKNOWN:
             continue
         if not hidden(full):
             nodes.add(full)
+        if count > 1:
+            namesakes.add(full)
         _read_node(node, name, namespace, full, topics, services)
+    if namesakes:
+        _read_namesakes(node, namesakes, topics, services)
     plain, actions = _split(services)
     return GraphView(
         topics={
@@ -57,9 +68,7 @@ def read(node: Any, own: tuple[str, ...]) -> GraphView:
     )
 
 
-def _read_node(
-    node: Any, name: str, namespace: str, full: str, topics: _Topics, services: dict[str, dict[str, set[str]]]
-) -> None:
+def _read_node(node: Any, name: str, namespace: str, full: str, topics: _Topics, services: _Services) -> None:
     try:
         published = node.get_publisher_names_and_types_by_node(name, namespace)
         subscribed = node.get_subscriber_names_and_types_by_node(name, namespace)
@@ -75,8 +84,31 @@ def _read_node(
             services[service][type].add(full)
 
 
+def _read_namesakes(node: Any, names: set[str], topics: _Topics, services: _Services) -> None:
+    """Read the endpoints of all nodes with these full names.
+
+    A node that was killed is one of them until its lease ends, and the one that replaces it is another.
+    """
+    for topic, _ in node.get_topic_names_and_types():
+        for ends, found in (
+            (topics.publishers, node.get_publishers_info_by_topic(topic)),
+            (topics.subscribers, node.get_subscriptions_info_by_topic(topic)),
+        ):
+            for each in found:
+                full = full_name(each.node_name, each.node_namespace)
+                if full in names:
+                    topics.types[topic].add(each.topic_type)
+                    ends[topic].add(full)
+    for service, types in node.get_service_names_and_types():
+        for each in servers(node, service):
+            full = full_name(each.node_name, each.node_namespace)
+            if full in names:
+                for type in types:
+                    services[service][type].add(full)
+
+
 def _split(
-    services: dict[str, dict[str, set[str]]],
+    services: _Services,
 ) -> tuple[dict[str, link.Service], dict[str, link.Service]]:
     """Split into services and actions, which are recognised by the service that receives their goals."""
     plain: dict[str, link.Service] = {}
@@ -93,27 +125,27 @@ def _split(
     return plain, actions
 
 
+def servers(node: Any, service: str) -> list[Any]:
+    """Endpoints that receive the requests of a service; the list of all services also has those for which
+    there are only clients.
+
+    :param node: an rclpy node
+    :param service: its full name
+    """
+    return list(node.get_subscriptions_info_by_topic(f"rq{service}Request", no_mangle=True))
+
+
 def provider(node: Any, service: str, own: tuple[str, ...]) -> str | None:
     """Full name of the node that provides a service; ``None`` if no other node does.
-
-    Read node by node: the list of all services also has those for which there are only clients.
 
     :param node: an rclpy node
     :param own: names of our own nodes, which are ignored
     """
-    for name, namespace in node.get_node_names_and_namespaces():
-        if name in own:
-            continue
-        if service in _served(node, name, namespace):
-            return full_name(name, namespace)
+    for each in servers(node, service):
+        # An endpoint whose node is unknown may be our own.
+        if each.node_name not in (*own, UNKNOWN):
+            return full_name(each.node_name, each.node_namespace)
     return None
-
-
-def _served(node: Any, name: str, namespace: str) -> set[str]:
-    try:
-        return {each for each, _ in node.get_service_names_and_types_by_node(name, namespace)}
-    except Exception:  # the node left between two calls
-        return set()
 
 
 def endpoint_ids(endpoints: Iterable[Any]) -> frozenset[bytes]:

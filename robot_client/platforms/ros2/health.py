@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,11 +13,14 @@ from rclpy.serialization import deserialize_message
 
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import LABEL_LENGTH
-from robot_client.alerts import OnAlert
+from robot_client.alerts import MODULE, OnAlert
 from robot_client.platforms.base import GraphView, OnSample
 from robot_client.platforms.ros2.types import Types
 
 BATTERY = "sensor_msgs/msg/BatteryState"
+BATTERY_PART = "battery topic"
+"""The part in alerts about the charge. No module has such a name."""
+
 TOPIC = "/diagnostics"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 KIND = "diagnostics"
@@ -54,12 +58,16 @@ class BatteryReader:
     """Reads the first battery topic of the graph.
 
     :param subscribe: subscribes to a topic of type :data:`BATTERY`
+    :param alert: receives an alert while the charge is out of range
     """
 
-    def __init__(self, types: Types, subscribe: Callable[[str, OnSample], object]) -> None:
+    def __init__(self, types: Types, subscribe: Callable[[str, OnSample], object], alert: OnAlert) -> None:
         self._types = types
         self._subscribe = subscribe
+        self._alert = alert
         self._subscribed = False
+        self._topic = ""
+        self._out_of_range = False
         self._sample: bytes | None = None
 
     def update(self, view: GraphView) -> None:
@@ -74,7 +82,7 @@ class BatteryReader:
             return
         with suppress(SwitchboardError):  # the type is not installed
             self._subscribe(topic, self._on_message)
-        self._subscribed = True
+        self._topic, self._subscribed = topic, True
 
     def charge(self) -> float | None:
         """Charge, 0 to 1; ``None`` if unknown."""
@@ -85,7 +93,26 @@ class BatteryReader:
         except Exception:  # any node may publish anything there; rclpy's errors differ between releases
             self._sample = None
             return None
-        return float(state.percentage) if 0.0 <= state.percentage <= 1.0 else None
+        charge = float(state.percentage)
+        known = 0.0 <= charge <= 1.0
+        # NaN is not measured (sensor_msgs/BatteryState).
+        self._report_range(charge, out_of_range=not known and not math.isnan(charge))
+        return charge if known else None
+
+    def _report_range(self, charge: float, out_of_range: bool) -> None:
+        """Raise or end the alert; it is not repeated for each further value."""
+        if out_of_range == self._out_of_range:
+            return
+        self._out_of_range = out_of_range
+        if out_of_range:
+            text = (
+                f"{self._topic} reports a charge of {charge:g}, which is not from 0 to 1; it counts as unknown. "
+                "Publish 'percentage' as a fraction, and NaN when it is not measured"
+            )
+            self._alert("warning", text, MODULE, BATTERY_PART)
+        else:
+            text = f"the charge that {self._topic} reports is in range again"
+            self._alert("info", text, MODULE, BATTERY_PART, over=True)
 
     def _on_message(self, body: bytes) -> None:
         self._sample = body

@@ -108,7 +108,7 @@ class Ros2Platform(Platform):
         self._publishers: list[RosPublisher] = []
         self._last_topics: Mapping[str, link.Topic] = {}
         self._graph_reads = 0
-        self._battery = BatteryReader(self._types, self._subscribe_battery) if battery else None
+        self._battery = BatteryReader(self._types, self._subscribe_battery, self._alert) if battery else None
         self._diagnostics = (
             Diagnostics(self._types, self._subscribe_diagnostics, self._alert, reactor.seconds)
             if diagnostics

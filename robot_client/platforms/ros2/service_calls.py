@@ -10,7 +10,7 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from robot_client.platforms.base import Check
-from robot_client.platforms.ros2 import qos
+from robot_client.platforms.ros2 import graph, qos
 from robot_client.platforms.ros2.errors import error_text
 from robot_client.platforms.ros2.executor import ReactorBridge
 from robot_client.platforms.ros2.types import Types
@@ -127,8 +127,7 @@ class RosServiceCalls:
 
     def servers(self, service: str) -> list[Any]:
         """Endpoints in the graph that receive the requests of a service."""
-        topic = f"rq{self.node.resolve_service_name(service)}Request"
-        return list(self.node.get_subscriptions_info_by_topic(topic, no_mangle=True))
+        return graph.servers(self.node, self.node.resolve_service_name(service))
 
 
 class _RosCall:

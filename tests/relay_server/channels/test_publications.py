@@ -64,22 +64,65 @@ def test_qos_of_a_first_message_reaches_the_robot(world: World) -> None:
     assert person.reported() == []
 
 
-def test_options_of_the_first_subscriber_stay(world: World) -> None:
+def test_options_of_the_first_client_stay(world: World) -> None:
     """They stay when the robot reconnects. A client with other options gets a warning with its id."""
     first, second = world.at_work(), world.person()
     second.says("set_level", level="warning")
-    first.says("advertise", topic="/out", type=STRING, latch=True, queue_size=5, qos={"depth": 2})
-    second.says("advertise", topic="/out", type=STRING, latch=True, id="same")
+    first.says("advertise", topic="/out", type=STRING, queue_size=5, qos={"depth": 2})
+    second.says("advertise", topic="/out", type=STRING, id="same")
     assert second.reported() == []
     world.robot_goes()
-    second.says("advertise", topic="/out", type=STRING, id="no latch")
-    second.says("advertise", topic="/out", type=STRING, latch=True, qos={"depth": 3}, id="qos")
+    second.says("advertise", topic="/out", type=STRING, latch=True, id="latch")
+    second.says("advertise", topic="/out", type=STRING, qos={"depth": 3}, id="qos")
     warnings = second.received("status")
-    assert [(each["level"], each["id"]) for each in warnings] == [("warning", "no latch"), ("warning", "qos")]
+    assert [(each["level"], each["id"]) for each in warnings] == [("warning", "latch"), ("warning", "qos")]
     assert warnings[0]["msg"] == "/out is advertised already; its first latch and qos stay"
     world.robot_comes()
     (asked,) = world.robot_joins().all(link.Advertise)
-    assert (asked.latch, asked.queue_size, asked.qos) == (True, 5, QoS(depth=2))
+    assert (asked.latch, asked.queue_size, asked.qos) == (False, 5, QoS(depth=2))
+
+
+LATCHING = [{"latch": True}, {"qos": {"durability": "transient_local"}}]
+
+
+@pytest.mark.parametrize("options", LATCHING)
+def test_each_client_that_latches_has_a_publisher_of_its_own(world: World, options: dict[str, Any]) -> None:
+    """So late subscribers get the last message of each, as of several nodes. The others share one."""
+    first, second, third, fourth = (world.at_work(), world.person(), world.person(), world.person())
+    second.says("set_level", level="warning")
+    first.says("advertise", topic="/tf_static", type=STRING, **options)
+    second.says("advertise", topic="/tf_static", type=STRING, **options)
+    third.says("advertise", topic="/tf_static", type=STRING)
+    fourth.says("publish", topic="/tf_static", msg={"data": "4"})
+    world.define()
+    asked = world.link.all(link.Advertise)
+    assert [each.latch or each.qos is not None for each in asked] == [True, True, False]
+    for number, person in enumerate((first, second, third)):
+        person.says("publish", topic="/tf_static", msg={"data": str(number)})
+    numbers = {words(body): number for number, _, body in world.link.samples}
+    assert [numbers[each] for each in ("0", "1", "2", "4")] == [
+        asked[0].number,
+        asked[1].number,
+        asked[2].number,
+        asked[2].number,
+    ]
+    assert second.reported() == []
+    second.session.end()
+    assert world.link.all(link.Unadvertise) == [link.Unadvertise(number=asked[1].number)]
+    world.robot_goes()
+    world.robot_comes()
+    assert len(world.robot_joins().all(link.Advertise)) == 2
+    for person in (first, third, fourth):
+        person.session.end()
+    assert world.channel.link_state.names_in_use == 0
+
+
+def test_clients_that_command_motion_share_a_publisher(world: World) -> None:
+    """Motion is never latched."""
+    first, second = world.at_work(), world.person()
+    for person in (first, second):
+        person.says("advertise", topic="/cmd_vel", type=TWIST, latch=True)
+    assert len(world.link.all(link.Advertise)) == 1
 
 
 def test_unadvertising_what_was_not_advertised_is_warned_of(world: World) -> None:
@@ -372,7 +415,7 @@ def test_a_type_without_definition_fails_its_topics(world: World) -> None:
     person.says("publish", topic="/cmd_vel", msg={})
     world.channel.message(link.Failed(request="get_type", reference=TWIST, reason="not installed"))
     assert person.reported() == ["publish /cmd_vel: not installed", "advertise /cmd_vel: not installed"]
-    assert not world.channel.publications._topics["/cmd_vel"].queued
+    assert not any(each.queued for each in world.channel.publications._topics["/cmd_vel"])
 
 
 def test_a_robot_of_json_is_sent_json(world: World) -> None:
@@ -598,7 +641,7 @@ def test_memory_per_client_is_bounded(world: World) -> None:
     for number in range(5):
         person.says("advertise", topic=f"/t{number}", type=STRING)
         person.says("publish", topic=f"/t{number}", msg={"data": "x" * 300_000})
-    held = [len(each.queued) for each in world.channel.publications._topics.values()]
+    held = [len(each.queued) for each in world.channel.publications._by_number.values()]
     assert sum(held) == 3
     assert len([words for words in person.reported() if "too much waits" in words]) == 2
     person.session.end()

@@ -158,10 +158,10 @@ def test_a_channel_is_withdrawn_when_its_waiting_message_was_published(world: Fo
     assert not world.link.samples
     world.answer(client)
     assert [body for _, _, body in world.link.samples] == [text("first")]
-    assert world.channel.publications.find("/new") is None
-    assert world.channel.publications.find("/newer") is not None
+    assert world.channel.publications.advertisers("/new") == []
+    assert world.channel.publications.advertisers("/newer") != []
     client.sends("unadvertise", channelIds=[1])
-    assert world.channel.publications.find("/newer") is None
+    assert world.channel.publications.advertisers("/newer") == []
 
 
 def test_hidden_topics_are_not_advertised(world: FoxgloveWorld) -> None:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 from rosbags.interfaces import QosDurability, QosLiveliness, QosReliability
 from rosbags.rosbag2.storage_mcap import McapReader
 
+from relay_protocol.ros_types import TypeRegistry
 from relay_server.recordings.mcap_file import (
     CHUNKS,
     McapChannel,
@@ -19,7 +23,14 @@ from relay_server.recordings.mcap_file import (
     chunk_bytes,
     repair_file,
 )
-from tests.worlds.mcap_reader import CHATTER, WORDS, profile, read
+from tests.worlds.mcap_reader import (
+    CHATTER,
+    WORDS,
+    profile,
+    read,
+    value_by_mcap_ros2,
+    value_by_rosbags,
+)
 from tests.worlds.relay import text
 
 
@@ -51,6 +62,70 @@ def test_a_file_holds_what_was_added(tmp_path: Path) -> None:
     assert json.loads(second.schema) == {"type": "object", "properties": {}}
     assert third.topic == "/other"
     assert profile(path) == "ros2"
+
+
+FIBONACCI = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"
+SET_BOOL = "bool data\n---\nbool success\nstring message\n"
+SPELLED = f"""\
+Header header
+some_msgs/msg/Point[2] corners # as a robot's author may write it
+{"=" * 80}
+MSG: some_msgs/msg/Point
+float64 x
+{"=" * 80}
+MSG: std_msgs/msg/Header
+builtin_interfaces/msg/Time stamp
+string frame_id
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "definition", "name", "message", "value"),
+    [
+        (
+            "some_msgs/action/Fibonacci",
+            FIBONACCI,
+            "some_msgs/action/Fibonacci_FeedbackMessage",
+            b'{"feedback":{"sequence":[3,4]}}',
+            lambda found: list(found.feedback.sequence) == [3, 4],
+        ),
+        (
+            "std_srvs/srv/SetBool",
+            SET_BOOL,
+            "std_srvs/srv/SetBool_Event",
+            b'{"info":{"sequence_number":7},"response":[{"message":"on"}]}',
+            lambda found: (found.info.sequence_number, found.response[0].message) == (7, "on"),
+        ),
+        (
+            "some_msgs/msg/Square",
+            SPELLED,
+            "some_msgs/msg/Square",
+            b'{"header":{"stamp":{"sec":1,"nanosec":2}},"corners":[{"x":1.5},{"x":2.5}]}',
+            lambda found: (found.header.stamp.sec, [each.x for each in found.corners]) == (1, [1.5, 2.5]),
+        ),
+    ],
+    ids=lambda value: value.rpartition("/")[2] if isinstance(value, str) and value.count("/") == 2 else "",
+)
+def test_other_readers_decode_types_without_a_file_of_their_own(
+    tmp_path: Path, source: str, definition: str, name: str, message: bytes, value: Callable[[Any], bool]
+) -> None:
+    """Their schemas are written as .msg files are: types are ``package/Name``, after a line of ``=`` too."""
+    types = TypeRegistry()
+    types.add(source, definition)
+    body, whole = types.from_json(name, message, 0), types.full_text(name)
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        file = McapFile(stream, 10**6, ros=True)
+        file.add(McapChannel("/derived", name, "cdr", whole), 1, 1, body)
+        file.finish()
+    (written,) = read(path)
+    assert written.schema == whole.encode()
+    assert not re.search("/(msg|srv|action)/", whole)
+    assert value(value_by_rosbags(written.schema, written.body))
+    assert value(value_by_mcap_ros2(written.schema, written.body))
+    again = TypeRegistry()
+    again.add(name, whole)
+    assert again.to_json(name, body) == types.to_json(name, body)
 
 
 def test_a_topic_whose_definition_changes_becomes_another_channel(tmp_path: Path) -> None:

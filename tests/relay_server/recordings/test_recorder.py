@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from twisted.internet.defer import Deferred
 
 from relay_protocol import link
-from relay_protocol.errors import Invalid, Refused, Unavailable
+from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.frames import VideoFrame
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
+from relay_server.channels.robot_clock import TYPE
 from relay_server.recordings import recorder
 from relay_server.recordings import recorder as module
 from relay_server.recordings.library import RecordingEntry, RecordingState, why_denied
@@ -402,16 +405,96 @@ def test_images_that_began_while_it_was_begun_are_found(world: World) -> None:
     assert "view on /chatter is denied" in other.entry.reason
 
 
-def test_a_topic_that_is_not_there_is_refused_and_nothing_has_begun(world: World) -> None:
-    """The robot receives no request."""
+def test_a_topic_that_is_not_there_is_recorded_when_it_comes(world: World) -> None:
+    """Until then it is a problem. The others are recorded meanwhile."""
     world.at_work()
-    scene = RecorderWorld(world, (HERE, "/nowhere"))
-    with pytest.raises(Invalid, match="/nowhere does not exist"):
-        scene.starts()
-    assert scene.recorder not in world.channel.members
-    assert world.link.all(link.Subscribe)[-1].topic == HERE
-    assert len(world.link.all(link.Unsubscribe)) == 1
-    assert not scene.memory_writer.begun
+    scene = RecorderWorld(world, (HERE, "/later", "/nowhere"))
+    scene.starts()
+    world.channel.sample(scene.received(), text("a"), 5)
+    waiting = "these topics do not exist yet, and are recorded when they come: "
+    assert scene.entry.problems == [waiting + "/later, /nowhere"]
+    later = link.Topic(types=[STRING], publishers=["/node"])
+    world.registry.graph(world.robot, link.Graph(topics={"/later": later}))
+    assert scene.entry.problems == [waiting + "/nowhere"]
+    assert world.link.all(link.Subscribe)[-1].topic == "/later"
+    world.channel.sample(scene.received(), text("b"), 6)
+    assert [(each.track.topic, each.body) for each in scene.memory_writer.written] == [
+        (HERE, text("a")),
+        ("/later", text("b")),
+    ]
+    scene.recorder.stop("enough")
+    assert scene.entry.problems == ["these topics did not exist while it was recorded: /nowhere"]
+
+
+def test_a_topic_that_was_not_there_when_the_robot_came_is_a_problem_too(world: World) -> None:
+    """The recording has begun while the robot was offline."""
+    scene = RecorderWorld(world, tuple(f"/nowhere{number}" for number in range(12)))
+    scene.starts()
+    assert scene.entry.problems == []
+    world.robot_comes()
+    world.robot_joins()
+    world.registry.graph(world.robot, link.Graph(topics={HERE: None}))
+    (problem,) = scene.entry.problems
+    assert problem.startswith("these topics do not exist yet, and are recorded when they come: /nowhere0, ")
+    assert problem.endswith("/nowhere9 and 2 more")
+
+
+def test_a_topic_that_comes_with_images_takes_the_right_to_view_them(world: World) -> None:
+    """Nothing of it is requested from the robot without that right."""
+    world.at_work()
+    scene = RecorderWorld(world, ("/later",))
+    scene.rights("view:/later")
+    scene.starts()
+    images = link.Topic(types=["sensor_msgs/msg/Image"], publishers=["/camera"])
+    world.registry.graph(world.robot, link.Graph(topics={"/later": images}))
+    assert "view on /later is denied" in scene.entry.reason
+    assert world.link.all(link.Subscribe) == []
+
+
+def test_a_clock_that_jumps_is_a_problem(world: World) -> None:
+    """Back or forward, once for each jump. A sample that arrives late is none."""
+    scene, number = begun(world)
+    second = 10**9
+    world.channel.sample(number, text("a"), 100 * second)
+    world.clock.advance(5)
+    world.channel.sample(number, text("late"), 101 * second)
+    world.clock.advance(0.1)
+    world.channel.sample(number, text("b"), 105 * second)
+    assert scene.entry.problems == []
+    for stamp in (90, 91, 4000, 4001):
+        world.clock.advance(1)
+        world.channel.sample(number, text("c"), stamp * second)
+    words = "times before and after it do not compare"
+    assert scene.entry.problems == [
+        f"the robot's clock jumped back by 15 s; {words}",
+        f"the robot's clock jumped forward by 3908 s; {words}",
+    ]
+    assert len(scene.memory_writer.written) == 7
+
+
+def test_simulated_time_that_jumps_back_is_a_problem(world: World) -> None:
+    """A jump after the end changes nothing."""
+    listeners = world.channel.robot_clock.on_jump
+    world.robot_comes()
+    world.registry.described(world.robot, msgspec.structs.replace(world.robot.description, sim_time=True))
+    scene = RecorderWorld(world)
+    scene.starts()
+    world.robot_joins()
+    (asked,) = [each for each in world.link.all(link.Subscribe) if each.topic == "/clock"]
+    world.channel.message(
+        link.Subscribed(number=asked.number, topic="/clock", type=TYPE, encoding="cdr", publishers=1)
+    )
+
+    def tick(seconds: int) -> None:
+        world.channel.sample(asked.number, b"\0\1\0\0" + struct.pack("<iI", seconds, 0), 0)
+
+    for seconds in (50, 51, 3):
+        tick(seconds)
+    problem = "the robot's simulated time jumped back; times before and after it do not compare"
+    assert scene.entry.problems == [problem]
+    assert len(listeners) == 1
+    scene.recorder.stop("enough")
+    assert listeners == []
 
 
 def test_the_reason_of_a_missing_topic_is_stored_with_the_recording(world: World) -> None:

@@ -19,6 +19,7 @@ from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import NO_ROBOT, Access, Principal
+from relay_server.channels import subscriptions
 from relay_server.common.database import AsyncDatabase
 from relay_server.events.bus import BusEvent, EventBus
 from relay_server.recordings import recordings as module
@@ -409,7 +410,9 @@ async def test_names_without_slash_are_taken_as_if_they_had_one(scene: Recording
 
 
 @pytest_twisted.ensureDeferred
-async def test_failed_recording_leaves_no_file(scene: RecordingsWorld) -> None:
+async def test_failed_recording_leaves_no_file(
+    scene: RecordingsWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No place is taken, and no permit is left."""
     for ask in (
         RecordingRequest(),
@@ -418,9 +421,11 @@ async def test_failed_recording_leaves_no_file(scene: RecordingsWorld) -> None:
         RecordingRequest(topics=["/camera/compressed"], cameras=["camera"]),
         RecordingRequest(cameras=["/"]),
         RecordingRequest(cameras=["a\nb"]),
-        RecordingRequest(topics=["/nowhere"], megabytes=1),
     ):
         await failure(scene.service.start(scene.ann, "rover", ask, HERE), Invalid)
+    monkeypatch.setattr(subscriptions, "USER_TOPICS", 0)
+    ask = RecordingRequest(topics=["/chatter"], megabytes=1)
+    await failure(scene.service.start(scene.ann, "rover", ask, HERE), Refused)
     assert list(scene.folder.iterdir()) == []
     assert scene.recordings.library.used == 0
     assert scene.doors.inside == 0

@@ -124,9 +124,9 @@ def test_taking_the_advertisement_back_ends_it(world: World) -> None:
     person, other = driving(world), world.person()
     other.says("advertise", topic="/cmd_vel", type=TWIST)
     person.says("unadvertise", topic="/cmd_vel")
-    assert person.context not in world.channel.publications._topics["/cmd_vel"].advertisers
+    assert person.context not in world.channel.publications.advertisers("/cmd_vel")
     drive(person)
-    assert person.context in world.channel.publications._topics["/cmd_vel"].advertisers
+    assert person.context in world.channel.publications.advertisers("/cmd_vel")
     for each in (person, other):
         each.says("unadvertise", topic="/cmd_vel")
     drive(person)

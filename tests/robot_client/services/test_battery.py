@@ -115,3 +115,18 @@ def test_faulty_missing_and_unknown_batteries_are_reported() -> None:
     assert (hot.level, hot.message) == (Level.ERROR, "the battery reports: overheat")
     assert gauge.finding(ChargeState(present=False)).level is Level.ERROR
     assert gauge.finding(ChargeState()).level is Level.WARN
+
+
+def test_charge_out_of_range_is_reported_in_words(tmp_path: Path) -> None:
+    """It is neither clamped nor left out, whatever else is known."""
+    wrong = "it reports a charge of 57, which is not from 0 to 1; "
+    found = Gauge(0.2, 0.1).finding(ChargeState(share=57.0))
+    assert (found.level, found.message) == (Level.WARN, wrong + "the charge of the battery is unknown")
+    gauge = Gauge(0.2, 0.1, (18.0, 24.0))
+    found = gauge.finding(ChargeState(share=57.0, volts=23.7))
+    assert (found.level, found.message) == (Level.WARN, wrong + "charged: 95 %")
+    found = gauge.finding(ChargeState(share=57.0, volts=18.3))
+    assert (found.level, found.message) == (Level.ERROR, wrong + "nearly empty: 5 %, charge it now")
+    folder = supply(tmp_path, type="Battery", capacity="104", status="Discharging")
+    found = gauge.finding(battery.parse_facts(battery.read(folder)))
+    assert found.message.startswith("it reports a charge of 1.04, which is not from 0 to 1; ")
