@@ -177,7 +177,7 @@ class TestFleet:
     def test_text_from_robots_is_inert(self, open_page: OpenPage) -> None:
         """Markup in a robot's description is shown as text and makes no elements."""
         page = open_page("/", user="admin")
-        card = page.locator("[data-robot=arm-3]")
+        card = page.locator("[data-robot=rover-2]")
         expect(card).to_contain_text("<img src=x onerror=alert(1)>")
         assert card.locator("img, b").count() == 0
 
