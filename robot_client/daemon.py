@@ -54,6 +54,9 @@ from robot_client.platforms.base import GraphView, Platform, full_graph, graph_c
 
 MAX_CHANNELS = 64
 
+SETTLE_SECONDS = 5.0
+"""Seconds in which a new participant discovers the nodes that the one before knew."""
+
 
 class Daemon(RobotPort):
     """Connects one platform to the relay.
@@ -106,6 +109,8 @@ class Daemon(RobotPort):
         self._link_loss = LinkLossAlert(now)
         self._machine = Machine()
         self._platform_faulty = False
+        self._graph_settles_at = clock.seconds()
+        """Until then changes of the graph are not reported, as the platform does not know all of it."""
         self._log = Logger("daemon")
         self._build_motion(guard, stop_store, hardware)
         tasks = [
@@ -172,6 +177,27 @@ class Daemon(RobotPort):
         """Fires when every zero is published, and all goals have ended or :data:`GOALS_END_SECONDS` are over."""
         goals = self._active_goals.goals_ended(GOALS_END_SECONDS)
         return self.motion.all_zeros_published().addCallback(lambda _: goals)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether the robot stands still, and no call or goal is under way."""
+        return (
+            self.motion.is_still
+            and not self._active_goals.active_actions
+            and not self._graph_zero_publisher.is_busy
+            and not any(each.channel.is_busy for each in self._channels.values())
+        )
+
+    def release_platform(self, reason: str) -> Deferred[Any]:
+        """Close all channels, which the relay opens again; fires when their motion has ended."""
+        self._close_channels(reason)
+        return self.motion_ended()
+
+    def renew_platform(self, reason: str) -> None:
+        """Make the platform again; channels that were opened meanwhile are closed."""
+        self._close_channels(reason)
+        self._graph_settles_at = self._clock.seconds() + SETTLE_SECONDS
+        self._platform.renew()
 
     def alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
         """Log and report an alert, see :class:`~robot_client.alerts.OnAlert`."""
@@ -385,6 +411,8 @@ class Daemon(RobotPort):
             return
         view = self._read_graph()
         if view is None:
+            return
+        if self._clock.seconds() < self._graph_settles_at:
             return
         changes = graph_changes(self._reported_graph, view)
         self._reported_graph = view

@@ -17,6 +17,7 @@ from twisted.python.threadpool import ThreadPool
 
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Unavailable
+from robot_client.address_changes import CHECK_SECONDS, AddressChanges
 from robot_client.camera.ipc import CameraSettings
 from robot_client.camera.service import DaemonCameras
 from robot_client.camera.supervisor import CameraSupervisor
@@ -41,7 +42,7 @@ from robot_client.motion.guard_supervisor import GuardSupervisor
 from robot_client.motion.hardware import Hardware
 from robot_client.motion.stop_store import StopStore
 from robot_client.offload.device import STATE_VARIABLE
-from robot_client.periodic import run_safely
+from robot_client.periodic import PeriodicTasks, run_safely
 from robot_client.platforms.base import Platform
 from robot_client.systemd import Notifier
 from robot_client.twisted_types import DialEndpoint
@@ -124,6 +125,10 @@ class DaemonProcess:
             dial=self._dial,
             agent=agent(),
         )
+        self._address_changes = PeriodicTasks(
+            [(AddressChanges(self).check, CHECK_SECONDS)] if self.platform.depends_on_addresses() else [],
+            reactor,
+        )
         self._notifier = Notifier(reactor, os.environ, lambda: self.platform.fault() is None)
 
     def start(self, before_modules: Callable[[], object] = lambda: None) -> None:
@@ -143,12 +148,14 @@ class DaemonProcess:
         before_modules()
         run_safely(self._log, "the modules can't be started", self.modules.start)
         self._local_orders.start(self.reactor)
+        self._address_changes.start()
         self._notifier.start()
 
     def stop(self) -> Deferred[Any]:
         """Stop the robot and everything else, within :data:`SHUTDOWN_SECONDS` even if a part hangs."""
         self._log.info("shutting down")
         self._notifier.stop()
+        self._address_changes.stop()
         stopping: list[Deferred[Any]] = [self.daemon.stop(), self.cameras.stop(), self.modules.stop()]
         stopping.append(self._local_orders.stop())
         if self.guard is not None:
@@ -159,6 +166,22 @@ class DaemonProcess:
         stopped.addTimeout(SHUTDOWN_SECONDS, self.reactor)
         stopped.addBoth(lambda _: deferToThread(self._file_threads.stop))
         return stopped.addBoth(lambda _: self.platform.stop())
+
+    @property
+    def is_idle(self) -> bool:
+        """See :class:`~robot_client.address_changes.RenewableRobot`."""
+        return self.daemon.is_idle
+
+    def release_platform(self, reason: str) -> Deferred[Any]:
+        """See :class:`~robot_client.address_changes.RenewableRobot`."""
+        return self.daemon.release_platform(reason)
+
+    def renew_platform(self, reason: str) -> None:
+        """See :class:`~robot_client.address_changes.RenewableRobot`."""
+        self.daemon.renew_platform(reason)
+        self.cameras.renew()
+        if self.guard is not None:
+            self.guard.renew()
 
     def _alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
         self.daemon.alert(level, text, kind, about, over)

@@ -77,6 +77,7 @@ class CameraSupervisor:
         self._idle_timer: DelayedCall | None = None
         self._exit_timer: DelayedCall | None = None
         self._stopped: Deferred[None] | None = None
+        self._renewing = False
         self._log = Logger("camera")
 
     @property
@@ -123,6 +124,12 @@ class CameraSupervisor:
     def max_streams(self) -> int:
         """Most streams at a time."""
         return self._settings.streams
+
+    def renew(self) -> None:
+        """Replace the process by another, whose node finds all others; the relay requests its streams again."""
+        if self._process is not None and self._stopped is None:
+            self._renewing = True
+            self._end_process()
 
     def stop(self) -> Deferred[None]:
         """End the process; fires when it has exited."""
@@ -171,7 +178,8 @@ class CameraSupervisor:
         for stream, requested in lost.items():
             if requested is not None:
                 self._waiting.setdefault(stream, requested)
-        if lost:
+        renewing, self._renewing = self._renewing, False
+        if lost and not renewing:
             steady = self._reactor.seconds() - self._started_at >= STEADY
             self._failures = 1 if steady else self._failures + 1
             self._loss_reported = True

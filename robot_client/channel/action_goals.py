@@ -53,6 +53,11 @@ class ChannelGoals(ChannelHandler):
         self._held_feedback: dict[str, link.ActionFeedback] = {}
         self._closed = False
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether goals are open."""
+        return bool(self._goals)
+
     def send_goal(self, message: link.SendActionGoal) -> None:
         """Send a goal to its action.
 

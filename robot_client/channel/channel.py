@@ -262,6 +262,11 @@ class RobotChannel:
             if subscription.topic == topic:
                 self._apply_inhibition(number, topic)
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether calls or goals are under way, in either direction."""
+        return any(each.is_busy for each in (self._calls, self._goals, self._services, self._actions))
+
     def cancel_goals(self, only_moving: bool) -> None:
         """See :meth:`robot_client.channel.action_goals.ChannelGoals.cancel_all`."""
         self._goals.cancel_all(only_moving)

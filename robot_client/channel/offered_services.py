@@ -85,6 +85,11 @@ class AdvertisedServices(ChannelHandler):
         self._pending_bytes = 0
         self._ids = count(1)
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether calls wait for their response."""
+        return bool(self._calls)
+
     def advertise(self, message: link.AdvertiseService) -> None:
         """Advertise a service.
 
@@ -166,6 +171,11 @@ class AdvertisedActions(ChannelHandler):
         self._goals: dict[str, _ExecutedGoal] = {}
         self._ids: dict[ServedGoal, str] = {}
         self._next_id = count(1)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether goals are open."""
+        return bool(self._goals)
 
     def advertise(self, message: link.AdvertiseAction) -> None:
         """Advertise an action.

@@ -42,6 +42,11 @@ class ChannelServiceCalls(ChannelHandler):
         self._offset = offset
         self._calls: dict[str, Deferred[None]] = {}
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether calls are open."""
+        return bool(self._calls)
+
     def call(self, message: link.CallService) -> None:
         """Call a service.
 

@@ -66,6 +66,11 @@ class GraphZeroPublisher:
         elif self._timer is None:
             self._close()
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether it has publishers."""
+        return bool(self._publishers)
+
     def start(self) -> None:
         """Begin to publish zeros; while they are under way, restart the count."""
         self._zeros_left = ZEROS

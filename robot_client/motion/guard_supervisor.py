@@ -81,6 +81,7 @@ class GuardSupervisor:
         self._failures = 0
         self._timer: DelayedCall | None = None
         self._exited: Deferred[None] | None = None
+        self._renewing = False
         self._log = Logger("guard")
 
     def start(self) -> None:
@@ -110,6 +111,12 @@ class GuardSupervisor:
         self._process.close()
         self._timer = self._reactor.callLater(EXIT_SECONDS, self._process.kill)
         return self._exited
+
+    def renew(self) -> None:
+        """Replace the process by another, whose node finds all others. Nothing must be moving."""
+        if self._process is not None and self._exited is None:
+            self._renewing = True
+            self._process.kill()
 
     @property
     def pid(self) -> int | None:
@@ -176,6 +183,10 @@ class GuardSupervisor:
         self._timer = None
         if self._exited is not None:
             self._exited.callback(None)
+            return
+        if self._renewing:
+            self._renewing = False
+            self.start()
             return
         least, most = RESTART_PAUSES
         delay = min(most, least * 2**self._failures)

@@ -144,6 +144,13 @@ class MotionControl:
         if not self._motion_inputs:
             self.on_motion_inputs_changed(False)
 
+    @property
+    def is_still(self) -> bool:
+        """Whether no topic moves the robot or is being stopped."""
+        return not any(
+            self._watchdog.moves(topic) or state.is_stopping for topic, state in self._topics.items()
+        )
+
     def may_be_commanded(self, topic: str) -> bool:
         """Whether a client's publication may command a topic."""
         return any(each.topic.name == topic for each in self._publications.values())

@@ -320,6 +320,18 @@ class Platform(Protocol):
     def fault(self) -> str | None:
         """A sentence that says why the middleware no longer works; ``None``: it works."""
 
+    def depends_on_addresses(self) -> bool:
+        """Whether it must be made again when the addresses of the machine change."""
+        return False
+
+    def renew(self) -> None:
+        """Leave the graph and join it again; all handles are closed.
+
+        :raises Unavailable: it can't join; :meth:`renew` may be called again
+        """
+        self.stop()
+        self.start()
+
 
 def graph_changes(old: GraphView, new: GraphView) -> link.Graph | None:
     """The changes between two views as a message; ``None`` if there are none."""

@@ -374,3 +374,42 @@ def test_shutdown_waits_for_the_last_zero(scene: Scene) -> None:
     scene.run(0.5)
     assert left == [None]
     assert scene.platform.published[1:] == 5 * [("/cmd_vel", twist())]
+
+
+def test_robot_is_idle_while_nothing_moves_it(scene: Scene) -> None:
+    """Not while a command or a zero is under way, nor with an open call."""
+    control = scene.register()
+    assert scene.daemon.is_idle
+    line = scene.driving(control)
+    assert not scene.daemon.is_idle
+    scene.command(line, twist())
+    scene.run(2.0)
+    assert scene.daemon.is_idle
+    scene.platform.services["/s"] = lambda request: request
+    scene.platform.pending_discovery = []
+    line.send(link.CallService(id="1", service="/s", type="x/srv/Y", timeout=5.0, cdr="AAEAAAA="))
+    assert not scene.daemon.is_idle
+
+
+def test_platform_that_is_made_again_loses_no_graph(scene: Scene) -> None:
+    """Channels are closed, for the relay to open them again; nodes that are not discovered yet are not reported as
+    gone.
+    """
+    control = scene.register()
+    line = scene.channel(control)
+    line.received()
+    control.received()
+    assert scene.daemon.release_platform("other addresses").called
+    assert [each for each in line.received() if each["op"] == "bye"] == [
+        {"op": "bye", "reason": "other addresses"}
+    ]
+    again = scene.channel(control)
+    scene.daemon.renew_platform("other addresses")
+    assert scene.platform.renewals == 1
+    assert "bye" in again.ops()
+    scene.platform.view = GraphView()
+    scene.run(2.0)
+    scene.platform.view = GraphView(nodes=frozenset({"/talker", "/new"}))
+    scene.run(4.0)
+    (reported,) = [each for each in control.received() if each["op"] == "graph"]
+    assert reported["nodes"] == {"/new": {}}

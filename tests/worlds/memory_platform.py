@@ -222,6 +222,7 @@ class MemoryPlatform(Platform):
         self.zero_templates: dict[str, bytes] = {}
         self.charge: float | None = None
         self.running = False
+        self.renewals = 0
         self.endpoint_ids: dict[str, set[bytes]] = {}
         """Result of :meth:`endpoints` by name."""
         self._after_samples: list[Callable[[], None]] = []
@@ -235,6 +236,9 @@ class MemoryPlatform(Platform):
 
     def stop(self) -> None:
         self.running = False
+
+    def renew(self) -> None:
+        self.renewals += 1
 
     def facts(self) -> Facts:
         return Facts("memory")

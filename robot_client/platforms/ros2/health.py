@@ -84,6 +84,10 @@ class BatteryReader:
             self._subscribe(topic, self._on_message)
         self._topic, self._subscribed = topic, True
 
+    def subscribe_again(self) -> None:
+        """Forget the subscription, which the platform has closed."""
+        self._subscribed = False
+
     def charge(self) -> float | None:
         """Charge, 0 to 1; ``None`` if unknown."""
         if self._sample is None:
@@ -202,6 +206,10 @@ class Diagnostics:
         with suppress(SwitchboardError):  # the type is not installed, so nothing can be read
             self._subscribe(TOPIC, self._on_message)
         self._subscribed = True
+
+    def subscribe_again(self) -> None:
+        """Forget the subscription, which the platform has closed."""
+        self._subscribed = False
 
     def _on_message(self, body: bytes) -> None:
         if not self._may_read():

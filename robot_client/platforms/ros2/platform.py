@@ -53,6 +53,7 @@ from robot_client.platforms.ros2.topics import (
     RosPublisher,
     RosSubscription,
 )
+from robot_client.platforms.ros2.transport import on_this_machine
 from robot_client.platforms.ros2.types import Types
 from robot_client.ros_log import ensure_log_folder
 
@@ -103,6 +104,7 @@ class Ros2Platform(Platform):
         self._types = Types()
         self._bridge = ReactorBridge(reactor.callFromThread)
         self._nodes = Nodes(name, executor, sim_time)
+        self._renewals = 0
         self._subscriptions: list[RosSubscription] = []
         self._stamps = LatchedStamps()
         self._publishers: list[RosPublisher] = []
@@ -152,6 +154,23 @@ class Ros2Platform(Platform):
         self._lingering.destroy_all(CLOSE_SECONDS)
         self._nodes.destroy()
         self._node = None
+
+    def depends_on_addresses(self) -> bool:
+        return not on_this_machine(os.environ)
+
+    def renew(self) -> None:
+        prepared = self._calls.prepared
+        self.stop()
+        # DDS discovery remembers a dead node for a while; a node of the same name would be mistaken for it.
+        self._renewals += 1
+        self._name = f"{self._own[0].removeprefix('/')}_{self._renewals}"
+        self._nodes = Nodes(self._name, self._nodes.kind, self._sim_time)
+        self.start()
+        for service, type in prepared:
+            self.prepare_call(service, type)
+        for reader in (self._battery, self._diagnostics):
+            if reader is not None:
+                reader.subscribe_again()
 
     def facts(self) -> Facts:
         return Facts(
@@ -340,7 +359,7 @@ class Ros2Platform(Platform):
         return None if self._battery is None else self._battery.charge()
 
     def fault(self) -> str | None:
-        return self._nodes.fault()
+        return self._nodes.fault() if self._node is not None else "the daemon has left the ROS graph"
 
     def _subscribe_diagnostics(self, topic: str, on_sample: OnSample) -> RosSubscription:
         return self.subscribe(topic, DIAGNOSTICS, link.QoS(depth=50), on_sample, lambda: None)

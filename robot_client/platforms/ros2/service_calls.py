@@ -65,6 +65,11 @@ class RosServiceCalls:
         self._client(service, type, self._types.service(type))
         self._prepared.add((service, type))
 
+    @property
+    def prepared(self) -> frozenset[tuple[str, str]]:
+        """Service and type of these clients, also after :meth:`close`."""
+        return frozenset(self._prepared)
+
     def is_prepared(self, service: str, type: str) -> bool:
         """Whether there is such a client."""
         return (service, type) in self._prepared
@@ -101,7 +106,6 @@ class RosServiceCalls:
         for known in self._clients.values():
             self.node.destroy_client(known.client)
         self._clients.clear()
-        self._prepared.clear()
 
     def _client(self, service: str, type: str, kind: Any) -> Any:
         known = self._clients.get((service, type))

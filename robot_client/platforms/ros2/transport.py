@@ -82,7 +82,7 @@ def without_shared_memory(middleware: str) -> Iterator[None]:
         file.write_text(profile(os.environ), encoding="utf-8")
         before = dict(os.environ)
         os.environ.update(dict.fromkeys(_PROFILES, str(file)))
-        if _on_this_machine(before):
+        if on_this_machine(before):
             # Limited to this machine, rmw_fastrtps would set its own transports, among them shared memory.
             os.environ[_RANGE] = "SYSTEM_DEFAULT"
             os.environ.pop(_LOCALHOST_ONLY, None)
@@ -101,7 +101,7 @@ def profile(environment: Mapping[str, str]) -> str:
     :raises Unavailable: ``ROS_STATIC_PEERS`` names an unknown host
     """
     interfaces = builtin = ""
-    if _on_this_machine(environment):
+    if on_this_machine(environment):
         peers = [_address(each.strip()) for each in environment.get(_PEERS, "").split(";") if each.strip()]
         if environment.get(_LOCALHOST_ONLY) == "1":
             peers = []  # as in rcl
@@ -111,7 +111,8 @@ def profile(environment: Mapping[str, str]) -> str:
     return _PROFILE.format(buffer=BUFFER, participants=_PARTICIPANTS, interfaces=interfaces, builtin=builtin)
 
 
-def _on_this_machine(environment: Mapping[str, str]) -> bool:
+def on_this_machine(environment: Mapping[str, str]) -> bool:
+    """Whether only nodes of this machine are discovered."""
     return environment.get(_RANGE) == "LOCALHOST" or environment.get(_LOCALHOST_ONLY) == "1"
 
 

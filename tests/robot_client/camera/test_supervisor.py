@@ -99,6 +99,21 @@ def test_process_leaves_some_time_after_the_last_stream(scene: Scene) -> None:
     assert scene.reactor.getDelayedCalls() == []
 
 
+def test_renewed_process_is_another_one_without_an_alert(scene: Scene) -> None:
+    """Streams that it has not accepted are opened by the next; the relay requests the others again."""
+    scene.keeper.renew()
+    assert scene.reactor.processes == []
+    scene.keeper.open(opening("a"))
+    scene.answer(StreamAccepted(stream="a"))
+    scene.keeper.open(opening("b"))
+    scene.keeper.renew()
+    assert scene.process.closed
+    scene.process.end()
+    assert len(scene.reactor.processes) == 2
+    assert scene.reported() == [opening("b")]
+    assert scene.alerts == []
+
+
 def test_stream_in_time_keeps_the_process(scene: Scene) -> None:
     """One that is opened before the 30 s are over uses the same process, which stays."""
     scene.keeper.open(opening("a"))

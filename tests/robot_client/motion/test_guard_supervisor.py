@@ -72,6 +72,18 @@ def test_ended_guard_is_restarted_with_topics_and_last_commands(scene: Scene) ->
     assert scene.process.lines == [GuardedTopic(*CMD), GuardedCommand(*CMD, True, 5)]
 
 
+def test_renewed_guard_is_another_process_without_an_alert(scene: Scene) -> None:
+    """At once, with topics and last commands, and with another node."""
+    scene.keeper.add_topic(CMD)
+    scene.keeper.renew()
+    former, _ = scene.reactor.processes
+    assert former.signals == ["KILL"]
+    assert scene.process.lines == [GuardedTopic(*CMD)]
+    assert scene.alerts == []
+    scene.process.end()
+    assert scene.alerts == ["module guard error"]
+
+
 def test_zero_templates_and_times_are_sent(scene: Scene) -> None:
     """Also to a restarted guard, until the topic is forgotten."""
     keeper = GuardSupervisor(scene.reactor, "guard", 500, topics={"/cmd_vel": 200})

@@ -1,0 +1,116 @@
+"""Makes the ROS participant again after the machine's addresses have changed.
+
+A participant of Fast DDS that exists when an address changes never finds nodes that start afterwards (Fast-DDS#6055).
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from typing import Protocol
+
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+
+try:
+    import psutil
+except ImportError:  # optional
+    psutil = None
+
+CHECK_SECONDS = 3.0
+"""Seconds between two looks at the addresses. A change counts when two looks agree, and so does standing still."""
+
+
+def own_addresses() -> frozenset[str]:
+    """IPv4 addresses of this machine with their interfaces; empty without psutil.
+
+    Loopback is left out, and IPv6, which DDS does not use by default.
+    """
+    if psutil is None:
+        return frozenset()
+    return frozenset(
+        f"{name} {each.address}"
+        for name, addresses in psutil.net_if_addrs().items()
+        for each in addresses
+        if each.family == socket.AF_INET and not each.address.startswith("127.")
+    )
+
+
+class RenewableRobot(Protocol):
+    """The robot's daemon, as far as its participant is made again."""
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether the robot stands still, and no call or goal is under way."""
+
+    def release_platform(self, reason: str) -> Deferred[object]:
+        """End what uses the platform; fires when the platform can be made again. The relay opens it again later."""
+
+    def renew_platform(self, reason: str) -> None:
+        """Make the platform again, and what else has a ROS node.
+
+        :raises Exception: that failed
+        """
+
+
+class AddressChanges:
+    """Watches the addresses; :meth:`check` is called every :data:`CHECK_SECONDS`.
+
+    :param read: the addresses now
+    """
+
+    def __init__(self, robot: RenewableRobot, read: Callable[[], frozenset[str]] = own_addresses) -> None:
+        self._robot = robot
+        self._read = read
+        self._known = self._latest = read()
+        self._announced: frozenset[str] | None = None
+        """The addresses of the change that was logged."""
+        self._was_idle = False
+        self._under_way = False
+        self._log = Logger("network")
+
+    def check(self) -> None:
+        """Make the participant again if the addresses have changed and the robot stands still."""
+        before, self._latest = self._latest, self._read()
+        if self._under_way or not self._latest or self._latest != before:
+            return
+        if self._latest == self._known:
+            self._announced = None
+            return
+        if self._announced != self._latest:
+            self._announced = self._latest
+            self._was_idle = False
+            self._log.warn(
+                "the machine's addresses have changed ({change}). ROS nodes that start now are not found until the "
+                "daemon's nodes are made again; that is done when the robot stands still and has nothing to do",
+                change=self._change(),
+            )
+        idle = self._robot.is_idle
+        if idle and self._was_idle:
+            self._renew()
+        self._was_idle = idle
+
+    def _change(self) -> str:
+        words = (("new", self._latest - self._known), ("gone", self._known - self._latest))
+        return "; ".join(f"{word}: {', '.join(sorted(each))}" for word, each in words if each)
+
+    def _renew(self) -> None:
+        self._under_way = True
+        reason = "the machine's addresses have changed"
+        released = self._robot.release_platform(reason)
+        released.addCallback(lambda _: self._renew_now(reason))
+        released.addErrback(
+            lambda failure: self._log.failure(
+                "the daemon's ROS nodes could not be made again; it is tried again", failure
+            )
+        )
+        released.addBoth(self._ended)
+
+    def _renew_now(self, reason: str) -> None:
+        addresses = self._read()
+        self._robot.renew_platform(reason)
+        self._known = addresses
+        self._log.info("the daemon's ROS nodes were made again: {reason}", reason=reason)
+
+    def _ended(self, result: object) -> None:
+        self._under_way = self._was_idle = False

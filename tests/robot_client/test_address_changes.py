@@ -1,0 +1,111 @@
+"""The participant is made again after the addresses of the machine have changed."""
+
+from __future__ import annotations
+
+import pytest
+from twisted.internet.defer import Deferred, succeed
+from twisted.logger import formatEvent, globalLogPublisher
+
+from robot_client.address_changes import AddressChanges, own_addresses
+
+HOME, AWAY, VPN = "wlan0 10.0.0.5", "wlan0 10.9.0.7", "tun0 10.8.0.2"
+
+
+class Robot:
+    """A machine with addresses, and a daemon on it."""
+
+    def __init__(self) -> None:
+        self.addresses = frozenset({HOME})
+        self.is_idle = True
+        self.fails = False
+        self.released: Deferred[object] | None = None
+        self.renewals: list[str] = []
+        self.changes = AddressChanges(self, lambda: self.addresses)
+
+    def release_platform(self, reason: str) -> Deferred[object]:
+        return succeed(None) if self.released is None else self.released
+
+    def renew_platform(self, reason: str) -> None:
+        if self.fails:
+            raise OSError("no network")
+        self.renewals.append(reason)
+
+    def has(self, *addresses: str, checks: int = 4) -> None:
+        """The machine has these addresses, for so many checks."""
+        self.addresses = frozenset(addresses)
+        for _ in range(checks):
+            self.changes.check()
+
+
+@pytest.fixture
+def robot() -> Robot:
+    return Robot()
+
+
+@pytest.mark.parametrize("addresses", [(AWAY,), (HOME, VPN)])
+def test_another_address_makes_the_participant_again_once(robot: Robot, addresses: tuple[str, ...]) -> None:
+    robot.has(HOME)
+    assert robot.renewals == []
+    robot.has(*addresses, checks=20)
+    assert robot.renewals == ["the machine's addresses have changed"]
+    robot.has(HOME)
+    assert len(robot.renewals) == 2
+
+
+def test_address_that_comes_back_changes_nothing(robot: Robot) -> None:
+    """Nor does an address that is there for a moment, or a machine without any."""
+    robot.has(checks=20)
+    robot.has(HOME)
+    robot.has(HOME, VPN, checks=1)
+    robot.has(HOME)
+    assert robot.renewals == []
+
+
+def test_it_waits_until_the_robot_stands_still(robot: Robot) -> None:
+    """Between two commands of a driver it does not stand still."""
+    robot.is_idle = False
+    robot.has(AWAY, checks=20)
+    for idle in (True, False) * 5:
+        robot.is_idle = idle
+        robot.changes.check()
+    assert robot.renewals == []
+    robot.is_idle = True
+    robot.has(AWAY, checks=2)
+    assert len(robot.renewals) == 1
+
+
+def test_nothing_is_made_again_before_the_motion_has_ended(robot: Robot) -> None:
+    robot.released = Deferred()
+    robot.has(AWAY, checks=20)
+    assert robot.renewals == []
+    robot.released.callback(None)
+    assert len(robot.renewals) == 1
+
+
+def test_failure_is_tried_again(robot: Robot) -> None:
+    robot.fails = True
+    robot.has(AWAY, checks=8)
+    robot.fails = False
+    robot.has(AWAY)
+    assert len(robot.renewals) == 1
+
+
+def test_change_is_logged_in_words(robot: Robot) -> None:
+    """Once when it is seen, and once when the participant is made again."""
+    said: list[str] = []
+    globalLogPublisher.addObserver(observer := lambda event: said.append(formatEvent(event)))
+    try:
+        robot.is_idle = False
+        robot.has(AWAY, VPN, checks=20)
+        assert [each.partition(" ROS ")[0] for each in said] == [
+            f"the machine's addresses have changed (new: {VPN}, {AWAY}; gone: {HOME})."
+        ]
+        robot.is_idle = True
+        robot.has(AWAY, VPN)
+    finally:
+        globalLogPublisher.removeObserver(observer)
+    assert said[1:] == ["the daemon's ROS nodes were made again: the machine's addresses have changed"]
+
+
+def test_own_addresses_have_no_loopback() -> None:
+    assert not [each for each in own_addresses() if " 127." in each]
