@@ -17,6 +17,9 @@ from relay_protocol.link.motion import SEND_GOAL
 from robot_client.platforms.base import GraphView
 
 GOAL_TYPE = "_SendGoal"
+NAMESAKES_EVERY = 3
+"""Reads of the graph after which endpoints of nodes with one full name are read again."""
+
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """Name of the node of an endpoint whose node is not discovered yet, or which has none."""
 
@@ -31,11 +34,58 @@ class _Topics(NamedTuple):
     subscribers: dict[str, set[str]]
 
 
-def read(node: Any, own: tuple[str, ...]) -> GraphView:
+class Namesakes:
+    """Endpoints of all nodes with the same full names.
+
+    A node that was killed is one of them until its lease ends, and the one that replaces it is another. They take some
+    ten times as long to read as other nodes (the endpoints of all topics), so not each read of the graph does it.
+    """
+
+    def __init__(self) -> None:
+        self._names: frozenset[str] = frozenset()
+        self._age = 0
+        self._publishers: set[tuple[str, str, str]] = set()
+        self._subscribers: set[tuple[str, str, str]] = set()
+        self._servers: set[tuple[str, str, str]] = set()
+        """Of each endpoint the topic or service, its type, and the full name of its node."""
+
+    def add_to(self, node: Any, names: frozenset[str], topics: _Topics, services: _Services) -> None:
+        """Add the endpoints of nodes with these full names."""
+        self._age += 1
+        if names != self._names or self._age >= NAMESAKES_EVERY:
+            self._names, self._age = names, 0
+            self._publishers, self._subscribers, self._servers = set(), set(), set()
+            if names:
+                self._read(node)
+        for ends, found in ((topics.publishers, self._publishers), (topics.subscribers, self._subscribers)):
+            for topic, type, full in found:
+                topics.types[topic].add(type)
+                ends[topic].add(full)
+        for service, type, full in self._servers:
+            services[service][type].add(full)
+
+    def _read(self, node: Any) -> None:
+        for topic, _ in node.get_topic_names_and_types():
+            for ends, found in (
+                (self._publishers, node.get_publishers_info_by_topic(topic)),
+                (self._subscribers, node.get_subscriptions_info_by_topic(topic)),
+            ):
+                ends.update((topic, each.topic_type, full) for each, full in self._of_them(found))
+        for service, types in node.get_service_names_and_types():
+            found = self._of_them(servers(node, service))
+            self._servers.update((service, type, full) for _, full in found for type in types)
+
+    def _of_them(self, endpoints: Iterable[Any]) -> list[tuple[Any, str]]:
+        named = ((each, full_name(each.node_name, each.node_namespace)) for each in endpoints)
+        return [(each, full) for each, full in named if full in self._names]
+
+
+def read(node: Any, own: tuple[str, ...], of_namesakes: Namesakes) -> GraphView:
     """Read the whole graph from the middleware's cache.
 
     :param node: an rclpy node
     :param own: prefixes of the full names of nodes that are left out, with everything that only they have
+    :param of_namesakes: is kept from one read to the next
     """
     topics = _Topics(defaultdict(set), defaultdict(set), defaultdict(set))
     services: _Services = defaultdict(lambda: defaultdict(set))
@@ -50,8 +100,7 @@ def read(node: Any, own: tuple[str, ...]) -> GraphView:
         if count > 1:
             namesakes.add(full)
         _read_node(node, name, namespace, full, topics, services)
-    if namesakes:
-        _read_namesakes(node, namesakes, topics, services)
+    of_namesakes.add_to(node, frozenset(namesakes), topics, services)
     plain, actions = _split(services)
     return GraphView(
         topics={
@@ -82,29 +131,6 @@ def _read_node(node: Any, name: str, namespace: str, full: str, topics: _Topics,
     for service, types in served:
         for type in types:
             services[service][type].add(full)
-
-
-def _read_namesakes(node: Any, names: set[str], topics: _Topics, services: _Services) -> None:
-    """Read the endpoints of all nodes with these full names.
-
-    A node that was killed is one of them until its lease ends, and the one that replaces it is another.
-    """
-    for topic, _ in node.get_topic_names_and_types():
-        for ends, found in (
-            (topics.publishers, node.get_publishers_info_by_topic(topic)),
-            (topics.subscribers, node.get_subscriptions_info_by_topic(topic)),
-        ):
-            for each in found:
-                full = full_name(each.node_name, each.node_namespace)
-                if full in names:
-                    topics.types[topic].add(each.topic_type)
-                    ends[topic].add(full)
-    for service, types in node.get_service_names_and_types():
-        for each in servers(node, service):
-            full = full_name(each.node_name, each.node_namespace)
-            if full in names:
-                for type in types:
-                    services[service][type].add(full)
 
 
 def _split(

@@ -105,6 +105,7 @@ class Ros2Platform(Platform):
         self._bridge = ReactorBridge(reactor.callFromThread)
         self._nodes = Nodes(name, executor, sim_time)
         self._renewals = 0
+        self._namesakes = graph.Namesakes()
         self._subscriptions: list[RosSubscription] = []
         self._stamps = LatchedStamps()
         self._publishers: list[RosPublisher] = []
@@ -186,7 +187,7 @@ class Ros2Platform(Platform):
 
     def graph(self) -> GraphView:
         """Read the graph; subscriptions and publishers adapt to its changes."""
-        view = graph.read(self._node, self._own)
+        view = graph.read(self._node, self._own, self._namesakes)
         self._refresh(view)
         self._calls.remove_idle()
         self._goals.remove_idle()
