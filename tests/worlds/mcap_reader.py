@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from relay_server.recordings.mcap_file import McapChannel
@@ -60,8 +60,7 @@ def value_by_rosbags(schema: bytes, body: bytes) -> Any:
 
 def value_by_mcap_ros2(schema: bytes, body: bytes) -> Any:
     """A message as mcap-ros2-support decodes it by its schema."""
-    dynamic = pytest.importorskip("mcap_ros2._dynamic")
-    return dynamic.generate_dynamic(_ANY, schema.decode())[_ANY](body)
+    return generate_dynamic(_ANY, schema.decode())[_ANY](body)
 
 
 def profile(path: Path) -> str:

@@ -6,11 +6,10 @@ import ctypes
 from collections.abc import Iterator
 from pathlib import Path
 
+import pygame
 import pytest
 
 from robot_client.apps.joystick import ButtonLayout, Gamepads, GamepadState
-
-pygame = pytest.importorskip("pygame")
 
 UNKNOWN = 0
 """The kind of joystick for which SDL has no names of buttons."""
