@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import statistics
 import time
 
 import psutil
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from bench.report import Options, Row
-from bench.robot import real_robot, settle
+from bench.robot import RealRobot, real_robot, settle
 from tests.worlds.waiting import wait_for
 
 PAUSE_SECONDS = 3.0
 """Seconds after which Foxglove and Lichtblick connect again."""
 
 TIMES = 100
+CUTS = 20
 PATIENCE = 20.0
 TOPIC = "/bench/scan"
 STREAMS = [{"topic": TOPIC, "kind": "scan", "rate": 40.0, "size": 0}]
@@ -47,6 +50,19 @@ def first_sample_ms(url: str) -> float:
         return 1000 * (time.monotonic() - began)
 
 
+def cut_ms(robot: RealRobot, address: str) -> float:
+    """Milliseconds from the begin of ``foxglove-url revoke`` to the end of a client that receives samples."""
+    made = robot.relay.cli("foxglove-url", "create", "rover", "watcher", "--relay", address)
+    with connect(made["url"], subprotocols=PROTOCOLS, open_timeout=PATIENCE, close_timeout=1) as client:
+        subscribe(client)
+        began = time.monotonic()
+        robot.relay.cli("foxglove-url", "revoke", str(made["id"]))
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                client.recv(PATIENCE)
+        return 1000 * (time.monotonic() - began)
+
+
 def run(options: Options) -> list[Row]:
     """One URL, many connections one after the other."""
     pause, times = options.pick(0, PAUSE_SECONDS), int(options.pick(3, options.runs or TIMES))
@@ -68,6 +84,7 @@ def run(options: Options) -> list[Row]:
             except Exception as error:
                 failures.append(repr(error))
         grown = max(0, process.memory_info().rss - before) / MIB
+        cut = [cut_ms(robot, address) for _ in range(int(options.pick(1, CUTS)))]
         wait_for("the robot is not in use", lambda: relay.state_of("rover") == "online", PATIENCE)
     print(f"    failures: {failures}; milliseconds {sorted(round(each) for each in took)}", flush=True)
     what = f"{times} connections by one Foxglove URL, {pause:g} s apart"
@@ -77,4 +94,11 @@ def run(options: Options) -> list[Row]:
         Row("reconnects", f"{what}: until the first scan, median", "ms", statistics.median(took)),
         Row("reconnects", f"{what}: until the first scan, longest", "ms", max(took)),
         Row("reconnects", f"{what}: growth of the relay's memory", "MiB", grown, bar=8),
+        Row(
+            "reconnects",
+            f"{len(cut)} revoked URLs: until the client is cut, longest",
+            "ms",
+            max(cut),
+            bar=1000,
+        ),
     ]

@@ -142,6 +142,17 @@ class Subscriptions:
             if each.unmatched and member in each.clients
         ]
 
+    def less_thinned(self, member: ChannelMember) -> list[str]:
+        """A client's topics whose point clouds have more points than it wants, since other clients need them."""
+        return [
+            each.topic
+            for each in self._topics.values()
+            if each.serves(member)
+            and (wanted := each.clients[member].thin) is not None
+            and wanted.thins
+            and each.least_thinning() != wanted
+        ]
+
     def latched(self, topic: str) -> bool:
         """Whether publishers of a topic keep their last messages for late joiners."""
         subscription = self._topics.get(topic)

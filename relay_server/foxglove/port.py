@@ -194,6 +194,7 @@ class FoxglovePort(WebsocketPort):
         self._follow_clock()
         self._show_control()
         self._show_drops()
+        self._show_thinning()
         self._context.statuses.remove_ended()
         self._topics.update()
         self._services.update()
@@ -290,6 +291,15 @@ class FoxglovePort(WebsocketPort):
             self._context.show(
                 "warning", f"messages that you publish are dropped: {_THIN_DOWNLINK}", "publish-drops"
             )
+
+    def _show_thinning(self) -> None:
+        """Show that clouds have more points than the options of this client ask for."""
+        topics = self._client.channel.subscriptions.less_thinned(self._client)
+        if topics:
+            words = f"{', '.join(sorted(topics))}: not thinned as asked, since other clients need more points"
+            self._context.show_state("warning", words, "thinning")
+        else:
+            self._context.statuses.remove("thinning")
 
     def _show_control(self) -> None:
         """Show who controls the robot, and whether it is stopped or offline."""

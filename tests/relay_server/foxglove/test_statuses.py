@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import pytest
+
 from relay_protocol import link
+from relay_protocol.rights import Level
 from tests.worlds.foxglove_client import Foxglove, FoxgloveWorld, twist
-from tests.worlds.relay import STRING, TWIST
+from tests.worlds.relay import STRING, TEXTS, TWIST
 
 
 def _drives(world: FoxgloveWorld, client: Foxglove) -> Callable[[float], None]:
@@ -83,3 +86,33 @@ def test_a_stale_command_is_dropped_with_a_status(world: FoxgloveWorld) -> None:
     stale = [each for each in client.statuses() if "too old" in each]
     assert len(stale) == 1
     assert "was dropped: it may be too old, by the last ping answered" in stale[0]
+
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+
+
+def test_a_client_whose_clouds_are_not_thinned_is_told_for_as_long_as_that_lasts(
+    world: FoxgloveWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot sends what the most demanding client needs."""
+    monkeypatch.setitem(TEXTS, CLOUD, "uint8[] data")
+    topic = link.Topic(types=[CLOUD], publishers=["/lidar"])
+    world.registry.graph(world.robot, link.Graph(topics={"/points": topic}))
+    world.gate.person("ann", Level.VIEWER)
+    world.gate.person("bob", Level.VIEWER)
+    ann = Foxglove(world.gate, "ann", path="/robots/rover?stride=4")
+    bob = Foxglove(world.gate, "bob")
+    world.settle(ann, bob)
+    for client in (ann, bob):
+        channel = client.channels()["/points"]["id"]
+        client.sends("subscribe", subscriptions=[{"id": 1, "channelId": channel}])
+        for asked in world.link.take(link.Subscribe):
+            world.subscribed(asked.number, CLOUD)
+        world.clock.advance(1)
+        assert client is bob or not any("thinned" in each for each in ann.statuses())
+    (status,) = (each for each in ann.took("status") if each["id"] == "thinning")
+    assert status["message"] == "/points: not thinned as asked, since other clients need more points"
+    assert not any("thinned" in each for each in bob.statuses())
+    bob.sends("unsubscribe", subscriptionIds=[1])
+    world.clock.advance(1)
+    assert any("thinning" in each["statusIds"] for each in ann.took("removeStatus"))
