@@ -1,6 +1,6 @@
 """Run pytest, and give the few tests that fail a second chance. Run by ``make test``.
 
-At most :data:`MOST_FAILURES` failed tests run once more, alone, one after another. Those that pass then are listed as
+If tests of at most :data:`MOST_FILES` files failed, they run once more, alone, one after another. Those that pass then are listed as
 flaky at the end and in ``build/flaky.txt``, one a line; they do not fail the run, and each of them needs mending.
 """
 
@@ -14,7 +14,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 FLAKY = ROOT / "build" / "flaky.txt"
 LAST_FAILED = ROOT / ".pytest_cache" / "v" / "cache" / "lastfailed"
-MOST_FAILURES = 10
+MOST_FILES = 10
+"""A fixture that fails makes all tests of its file fail, so files are counted."""
+
 TESTS_FAILED = 1
 """The exit code of pytest for failed tests; others are errors of the run itself, such as an unknown option."""
 
@@ -29,7 +31,7 @@ def main(options: list[str]) -> int:
     FLAKY.write_text("")
     code = _pytest("--cache-clear", *options)
     failed = _failed()
-    if code != TESTS_FAILED or len(failed) > MOST_FAILURES:
+    if code != TESTS_FAILED or len({test.partition("::")[0] for test in failed}) > MOST_FILES:
         return code
     sys.stdout.write(f"\nOnce more, alone, one after another: {len(failed)} failed tests\n")
     sys.stdout.flush()
