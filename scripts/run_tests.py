@@ -1,7 +1,8 @@
 """Run pytest, and give the few tests that fail a second chance. Run by ``make test``.
 
-If tests of at most :data:`MOST_FILES` files failed, they run once more, alone, one after another. Those that pass then are listed as
-flaky at the end and in ``build/flaky.txt``, one a line; they do not fail the run, and each of them needs mending.
+If tests of at most :data:`MOST_FILES` files failed, they run once more, alone, one after another. Those that pass then
+are listed as flaky at the end and in ``build/flaky.txt``, one a line; they do not fail the run, and each of them needs
+mending.
 """
 
 from __future__ import annotations
