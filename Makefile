@@ -22,7 +22,7 @@ demo: ## run a relay with two simulated robots and print how to log in (options:
 	@exec $(BIN)/switchboard demo $(DEMO)
 
 test: setup ## all tests: Python, ROS 2, browser, portal (options: PYTEST='-k drive')
-	$(BIN)/python scripts/run_tests.py -n 5 --dist loadfile --no-loadscope-reorder $(PYTEST)
+	$(BIN)/python scripts/run_tests.py -n 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
 	$(NPM) run test
 
 quick: setup ## the tests that need no ROS, browser or process, in two minutes (options: PYTEST='-k drive')
