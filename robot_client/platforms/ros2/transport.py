@@ -34,7 +34,11 @@ BUFFER = 4 * 1024 * 1024
 
 _PARTICIPANTS = 100
 """Participants of one machine that are discovered, of the 120 that have ports in a domain (DDSI-RTPS
-9.6.1.1)."""
+9.6.1.1). The last domain has room for fewer."""
+
+_DOMAIN = "ROS_DOMAIN_ID"
+_LAST_DOMAIN = 232
+_LAST_PORT = 65535
 
 _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
@@ -72,9 +76,14 @@ def without_shared_memory(middleware: str) -> Iterator[None]:
     """Nodes created in this context, the first of a process, do not use shared memory.
 
     :param middleware: from ``rclpy.get_rmw_implementation_identifier``
-    :raises Unavailable: ``ROS_STATIC_PEERS`` names an unknown host
+    :raises Unavailable: ``ROS_STATIC_PEERS`` names an unknown host, or the domain has no ports
     """
-    if not middleware.startswith("rmw_fastrtps") or any(os.environ.get(each) for each in _USER_SETTINGS):
+    if not middleware.startswith("rmw_fastrtps"):
+        yield
+        return
+    # Fast DDS ends the process where a port is too high, or hangs in its own exit handlers.
+    _participants(os.environ)
+    if any(os.environ.get(each) for each in _USER_SETTINGS):
         yield
         return
     with tempfile.TemporaryDirectory(prefix="switchboard-dds-", dir=temporary_parent()) as folder:
@@ -98,7 +107,7 @@ def without_shared_memory(middleware: str) -> Iterator[None]:
 def profile(environment: Mapping[str, str]) -> str:
     """XML profile of Fast DDS with UDP only, which respects the discovery settings of ROS 2.
 
-    :raises Unavailable: ``ROS_STATIC_PEERS`` names an unknown host
+    :raises Unavailable: ``ROS_STATIC_PEERS`` names an unknown host, or the domain has no ports
     """
     interfaces = builtin = ""
     if on_this_machine(environment):
@@ -108,12 +117,30 @@ def profile(environment: Mapping[str, str]) -> str:
         addresses = ["127.0.0.1", *peers]
         builtin = _BUILTIN.format(peers="".join(_PEER.format(address=each) for each in addresses))
         interfaces = "" if peers else _INTERFACES
-    return _PROFILE.format(buffer=BUFFER, participants=_PARTICIPANTS, interfaces=interfaces, builtin=builtin)
+    return _PROFILE.format(
+        buffer=BUFFER, participants=_participants(environment), interfaces=interfaces, builtin=builtin
+    )
 
 
 def on_this_machine(environment: Mapping[str, str]) -> bool:
     """Whether only nodes of this machine are discovered."""
     return environment.get(_RANGE) == "LOCALHOST" or environment.get(_LOCALHOST_ONLY) == "1"
+
+
+def _participants(environment: Mapping[str, str]) -> int:
+    """Participants of one machine that have ports in the domain, at most :data:`_PARTICIPANTS`.
+
+    :raises Unavailable: it has none
+    """
+    try:
+        domain = int(environment.get(_DOMAIN, ""))
+    except ValueError:
+        domain = 0  # rcl says what is wrong with it
+    if not 0 <= domain <= _LAST_DOMAIN:
+        raise Unavailable(f"{_DOMAIN} is {domain}; Fast DDS has ports for domains from 0 to {_LAST_DOMAIN}")
+    # DDSI-RTPS 2.2, section 9.6.1.4: the second port of the first participant; each has two.
+    first = 7400 + 250 * domain + 11
+    return min(_PARTICIPANTS, (_LAST_PORT - first) // 2)
 
 
 def _address(host: str) -> str:

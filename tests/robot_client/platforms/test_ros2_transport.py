@@ -73,18 +73,15 @@ def test_node_without_shared_memory_receives_others(settings: dict[str, str]) ->
     environment = {**os.environ, **settings, "ROS_DOMAIN_ID": str(free_domain())}
     with subprocess.Popen([sys.executable, "-c", SPEAKER], env=environment, stdin=subprocess.PIPE) as speaker:
         try:
-            listener = subprocess.run(
-                [sys.executable, "-c", LISTENER],
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=60,
-                check=False,
-            )
+            listener = _listener(environment)
         finally:
-            assert speaker.stdin is not None
-            speaker.stdin.close()
+            speaker.communicate()
     assert listener.stdout.split() == ["hello", "0"], listener.stderr
+
+
+def _listener(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", LISTENER]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
 
 
 def test_environment_is_restored(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,6 +115,27 @@ def test_static_peers_are_discovered() -> None:
     reported = ElementTree.fromstring(profile(settings))
     addresses = [each.text for each in reported.iter() if each.tag.endswith("}address")]
     assert addresses == ["127.0.0.1", "127.0.0.3", "127.0.0.1"]
+
+
+def test_the_last_domain_has_ports_for_a_listener_limited_to_this_machine() -> None:
+    environment = {**os.environ, "ROS_DOMAIN_ID": "232", "ROS_LOCALHOST_ONLY": "1"}
+    with subprocess.Popen([sys.executable, "-c", SPEAKER], env=environment, stdin=subprocess.PIPE) as speaker:
+        try:
+            listener = _listener(environment)
+        finally:
+            speaker.communicate()
+    assert listener.stdout.split() == ["hello", "0"], listener.stderr
+
+
+@pytest.mark.parametrize("domain", ["233", "300", "-1", str(2**32)])
+@pytest.mark.parametrize("chosen", [{}, {CHOICES[0]: "chosen"}], ids=["ours", "owner's"])
+def test_a_domain_without_ports_is_refused_in_words(
+    domain: str, chosen: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"ROS_DOMAIN_ID": domain, **chosen}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(Unavailable, match="from 0 to 232"), without_shared_memory(FASTRTPS):
+        raise AssertionError
 
 
 def test_unknown_peer_is_named_in_the_error() -> None:
