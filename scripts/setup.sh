@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Prepares .venv and what lives beside it. Each stage remembers what it was done for, so a second run is instant.
-#   scripts/setup.sh [python] [web] [interfaces] [fixtures] [browser] [broker]      (all of these, if none is named)
+#   scripts/setup.sh [python] [web] [interfaces] [fixtures] [browser] [broker] [proxies]   (all of these, if none is named)
 #   scripts/setup.sh bench                                                 (what 'make bench' compares with)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -280,6 +280,30 @@ stage_broker() {
     fi
 }
 
+# --- Proxies for the tests of docs/operate/behind_a_proxy.md; unpacked only, since an installed server is started --------
+
+unpack_proxies() {
+    local folder=$PWD/$venv/proxies
+    rm -rf "$folder"
+    mkdir -p "$folder/archives/partial"
+    if [ "$(id -u)" = 0 ]; then apt-get update -qq; fi
+    apt-get install -qq -y --download-only --no-install-recommends -o "Dir::Cache::archives=$folder/archives" \
+        -o Debug::NoLocking=1 nginx-light libnginx-mod-stream haproxy apache2-bin caddy || return
+    for package in "$folder"/archives/*.deb; do
+        [ ! -e "$package" ] || dpkg-deb --extract "$package" "$folder" || return
+    done
+    rm -r "$folder/archives"
+}
+
+stage_proxies() {
+    done_for proxies 1 && return
+    if command -v apt-get >/dev/null && run "proxies for the tests" unpack_proxies; then
+        note_done proxies 1
+    else
+        say "no proxies: their tests fail until there are nginx with its stream module, HAProxy, Caddy and Apache"
+    fi
+}
+
 # --- What 'make bench' compares with; no other command needs it -----------------------------------------------------
 
 stage_bench() {
@@ -311,10 +335,11 @@ for stage in "${@:-all}"; do
             stage_interfaces
             stage_browser
             stage_broker
+            stage_proxies
             wait $web
             ;;
-        python | web | interfaces | fixtures | browser | broker | bench) "stage_$stage" ;;
-        *) fail "there is no stage '$stage'; there are python, web, interfaces, fixtures, browser, broker and bench" ;;
+        python | web | interfaces | fixtures | browser | broker | proxies | bench) "stage_$stage" ;;
+        *) fail "there is no stage '$stage'; there are python, web, interfaces, fixtures, browser, broker, proxies and bench" ;;
     esac
 done
 if [ $((SECONDS - began)) -gt 2 ]; then

@@ -28,10 +28,20 @@ HEADER = 4096
 """Longest header that is parsed, in characters."""
 
 
+SHOWN = 200
+"""Characters of an address that an error shows."""
+
+
 class StaleNonce(BadCredentials):
     """The answer may be right, but the challenge is too old: answer the new one."""
 
     code = "stale_nonce"
+
+
+class WrongAddress(BadCredentials):
+    """The answer is right, but was made for another address than the request came to (RFC 7616, section 3.4)."""
+
+    code = "wrong_address"
 
 
 class Proof(NamedTuple):
@@ -103,13 +113,19 @@ class Digest:
         :param known: H(A1) of the key; for an unknown key a value that nothing matches
         :param uri: of the request, as it was sent
         :raises StaleNonce: the challenge is too old or unknown, or was answered with this count before
+        :raises WrongAddress: the answer is right for another address
         :raises BadCredentials: the answer is wrong
         """
         body = ":".join((proof.nonce, proof.uses, proof.cnonce, "auth", _hash(f"{method}:{proof.uri}")))
         response = proof.response.lower().encode("utf-8", "replace")
         right = hmac.compare_digest(_hash(f"{known}:{body}").encode(), response)
-        if not right or proof.uri != uri:
+        if not right:
             raise BadCredentials("the key is unknown or the secret is wrong")
+        if proof.uri != uri:
+            raise WrongAddress(
+                f"the answer is for {proof.uri[:SHOWN]!r}, but the request came to {uri[:SHOWN]!r}; "
+                "behind a proxy that changes addresses, send key and secret by Basic over TLS"
+            )
         if not self._fresh(proof.nonce):
             raise StaleNonce("the challenge is too old; answer the new one")
         self._count(proof)

@@ -20,7 +20,7 @@ from relay_server.http.limits import TooManyRequests
 from relay_server.http.media_types import MediaType
 from relay_server.http.openapi.operation import Credential, Response
 from relay_server.http.problems import WrongMethod, problem, problem_of
-from relay_server.oauth.digest import Digest, StaleNonce
+from relay_server.oauth.digest import Digest, StaleNonce, WrongAddress
 from relay_server.oauth.schemas import AboutToken, Introspection, Nothing, OAuthProblem, TokenForm, TokenInfo
 from relay_server.oauth.service import IssuedToken, OAuthError, TokenRequest
 
@@ -161,7 +161,7 @@ class OAuthEndpoints:
         if isinstance(error, (TooManyTries, TooManyRequests, Unavailable, WrongMethod)):
             return problem_of(request, error)
         name, status = "invalid_request", 400
-        if isinstance(error, BadCredentials):
+        if isinstance(error, BadCredentials) and not isinstance(error, WrongAddress):
             name, status = "invalid_client", 401
             challenge = self._service.digest.challenge(stale=isinstance(error, StaleNonce))
             challenges = [challenge.encode(), b'Basic realm="switchboard", charset="UTF-8"']

@@ -125,6 +125,7 @@ class OAuthService:
         :param inside: key and secret from the body, if they came there
         :raises BadCredentials: there is no such OAuth client, or the secret is wrong
         :raises StaleNonce: see :class:`Digest`
+        :raises WrongAddress: the same
         :raises TooManyTries: too many failures; decided before anything else
         """
         scheme = header.partition(" ")[0].lower()
@@ -155,7 +156,7 @@ class OAuthService:
         except BadCredentials as error:
             if error.code == BadCredentials.code:
                 self._publish_refused(key, found, address)
-            else:  # right, but late: no guess
+            else:  # right, but late or for another address: no guess
                 self._limiter.forgive(key, address)
             raise
         self._limiter.succeeded(key, address)

@@ -24,7 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from relay_protocol import PROTOCOL_VERSION, frames, identity, link
-from tests.e2e.test_tls import Authority
+from tests.worlds.certificates import Authority
 from tests.worlds.chaos_proxy import ChaosProxy
 from tests.worlds.fake_robot import FakeRobot
 from tests.worlds.machine_pauses import Pulse

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import ssl
 import time
 from typing import Any
 
@@ -24,8 +25,10 @@ class FakeRobot:
     It answers orders about motion by itself, as if they were done.
     """
 
-    def __init__(self, port: int, source: str = "127.0.0.1") -> None:
+    def __init__(self, port: int, source: str = "127.0.0.1", context: ssl.SSLContext | None = None) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), PATIENCE, source_address=(source, 0))
+        if context is not None:
+            self.socket = context.wrap_socket(self.socket, server_hostname="127.0.0.1")
         self._decoder = FrameDecoder(limits.RELAY_FRAME)
         self._heard: list[dict[str, Any]] = []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable
@@ -46,6 +47,8 @@ class SmallRobot:
     :param services: by name; each is a Trigger
     :param moving: names of those that move it
     :param source: address that it connects from
+    :param port: the relay's for robots, or that of a proxy
+    :param context: of TLS, if the port has it
     """
 
     def __init__(
@@ -55,6 +58,9 @@ class SmallRobot:
         services: dict[str, Service],
         moving: tuple[str, ...] = (),
         source: str = "127.0.0.1",
+        *,
+        port: int = 0,
+        context: ssl.SSLContext | None = None,
     ) -> None:
         self.relay = relay
         self.name = name
@@ -72,18 +78,20 @@ class SmallRobot:
         self.module_orders: list[tuple[str, str]] = []
         """Orders that it has accepted: module and action."""
         self._source = source
+        self._port = port
+        self._context = context
         self._services = services
         self._moving = list(moving)
         self._key = name.encode().ljust(32, b"\0")[:32]
         self._links: list[End] = []
         self._threads: list[threading.Thread] = []
         code = relay.cli("robot", "add", name)["enrolment_code"]
-        with End(relay.robots_port, source) as enrolling:
+        with self._dial() as enrolling:
             assert enrolling.enroll(name, code, self._key)["op"] == "enrolled"
 
     def comes(self) -> SmallRobot:
         """Connects and registers."""
-        control = End(self.relay.robots_port, self._source)
+        control = self._dial()
         assert control.register(self.name, self._key)["op"] == "welcome"
         motion = link.MotionPolicy(services=self._moving)
         control.send(link.Describe(platform="json", motion=motion))
@@ -111,6 +119,9 @@ class SmallRobot:
             each.socket.close()
         self._links, self._threads = [], []
 
+    def _dial(self) -> End:
+        return End(self._port or self.relay.robots_port, self._source, self._context)
+
     def _listen(self, end: End, take: Callable[[End, dict[str, Any]], None]) -> None:
         def loop() -> None:
             end.socket.settimeout(60)
@@ -137,12 +148,12 @@ class SmallRobot:
     def _order(self, control: End, message: dict[str, Any]) -> None:
         op = message["op"]
         if op == "open_channel":
-            channel = End(self.relay.robots_port, self._source)
+            channel = self._dial()
             channel.send(link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"]))
             self._listen(channel, self._asked)
             return
         if op == "open_video":
-            end = End(self.relay.robots_port, self._source)
+            end = self._dial()
             end.send(link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"]))
             end.send(link.StreamStatus(width=32, height=24, quality=80))
             end.send_bytes(encode_video(1, time.time_ns(), self.picture))

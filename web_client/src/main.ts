@@ -5,5 +5,6 @@ import App from './App.svelte'
 
 const target = document.getElementById('app')
 if (target === null) throw new Error('The page has no element with the id app.')
+target.replaceChildren()
 
 export default mount(App, { target })

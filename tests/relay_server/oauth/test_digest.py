@@ -10,7 +10,7 @@ import pytest
 from relay_server.access import BadCredentials
 from relay_server.auth import passwords
 from relay_server.oauth import digest as module
-from relay_server.oauth.digest import NONCE_SECONDS, Digest, StaleNonce
+from relay_server.oauth.digest import NONCE_SECONDS, Digest, StaleNonce, WrongAddress
 
 KEY, SECRET = "swc_1", "swb_secret"
 KNOWN = passwords.digest_ha1(KEY, SECRET)
@@ -79,14 +79,20 @@ def test_a_challenge_names_its_parameters(digest: Digest) -> None:
 
 @pytest.mark.parametrize(
     ("secret", "method", "uri"),
-    [("other", "POST", URI), (SECRET, "GET", URI), (SECRET, "POST", "/oauth/revoke")],
+    [("other", "POST", URI), ("other", "POST", "/oauth/revoke"), (SECRET, "GET", URI)],
 )
-def test_a_wrong_secret_or_request_is_refused(digest: Digest, secret: str, method: str, uri: str) -> None:
-    """An answer is valid for one method and one address."""
+def test_a_wrong_secret_or_method_is_refused(digest: Digest, secret: str, method: str, uri: str) -> None:
     proof = digest.read(Client(secret).answer(digest.challenge()))
     with pytest.raises(BadCredentials, match="secret is wrong") as caught:
         digest.check(proof, KNOWN, method, uri)
-    assert not isinstance(caught.value, StaleNonce)
+    assert caught.value.code == BadCredentials.code
+
+
+def test_an_answer_for_another_address_is_refused_with_both(digest: Digest) -> None:
+    proof = digest.read(Client().answer(digest.challenge()))
+    with pytest.raises(WrongAddress, match=r"'/oauth/token\?x=1', but the request came to '/token'"):
+        digest.check(proof, KNOWN, "POST", "/token")
+    digest.check(proof, KNOWN, "POST", URI)  # it is not used up
 
 
 def test_an_answer_counts_once(digest: Digest) -> None:

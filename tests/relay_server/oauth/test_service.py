@@ -6,6 +6,7 @@ import base64
 from collections.abc import Iterator
 from typing import Any
 
+import httpx
 import pytest
 import pytest_twisted
 from twisted.internet import reactor
@@ -18,6 +19,7 @@ from relay_server.auth.authenticator import Authenticator, TooManyTries
 from relay_server.auth.login_limiter import FAILURES
 from relay_server.common.database import AsyncDatabase
 from relay_server.events.bus import EventBus
+from relay_server.oauth.digest import WrongAddress
 from relay_server.oauth.service import ACCESS_SECONDS, REFRESH_SECONDS, OAuthError, OAuthService, TokenRequest
 
 HERE = "192.0.2.1"
@@ -218,6 +220,22 @@ async def test_guessing_a_secret_is_limited(there: World) -> None:
     with pytest.raises(TooManyTries):
         await prove(basic(KEY, SECRET), "POST", "/", HERE)
     assert (await prove(basic(KEY, SECRET), "POST", "/", "198.51.100.7")) is not None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_right_answer_for_another_address_is_no_guess(there: World) -> None:
+    """Such as that of a proxy which strips a part of the path."""
+    await there.fill()
+    request = httpx.Request("POST", "https://relay/robots/oauth/token")
+    flow = httpx.DigestAuth(KEY, SECRET).auth_flow(request)
+    next(flow)
+    challenge = {"www-authenticate": there.service.digest.challenge()}
+    header = flow.send(httpx.Response(401, headers=challenge, request=request)).headers["authorization"]
+    for _ in range(FAILURES + 1):
+        with pytest.raises(WrongAddress, match="/robots/oauth/token"):
+            await there.service.authenticate_client(header, "POST", "/oauth/token", HERE)
+    assert await there.service.authenticate_client(basic(KEY, SECRET), "POST", "/", HERE) is not None
+    assert not [data for kind, data in there.reported if kind == "login.refused"]
 
 
 @pytest_twisted.ensureDeferred
