@@ -134,7 +134,7 @@ CLIENT_MESSAGE = 10_000_000
 UNAUTHENTICATED_BYTES = 64 * KIB
 """Most bytes a connection may send before it is authenticated."""
 
-HTTP_BODY = 56 * KIB
+HTTP_BODY = 48 * KIB
 """Largest body of an HTTP request; with it a connection takes less than 64 KiB of the relay's memory."""
 
 FUNCTION_BYTES = 16 * MIB

@@ -41,6 +41,9 @@ HANDSHAKE_ATTRIBUTES = (
 MAX_PIECES = 16_384
 """Most frames of one message, and chunks of frames, together; empty ones take memory too."""
 
+SMALL_PART = 4096
+"""Parts of a frame with fewer bytes are joined."""
+
 CLOSE_SECONDS = 2.0
 """Seconds until a closed connection is aborted if the client has not read what was sent."""
 
@@ -149,8 +152,15 @@ class BoundedProtocol(FastProtocol):
         super().onMessageEnd()
 
     def onMessageFrameData(self, payload: bytes) -> None:
-        """A part of a frame has come."""
+        """A part of a frame has come. Small parts are joined: a client's network may send few bytes at a time."""
         super().onMessageFrameData(payload)
+        parts: list[Any] = self.frame_data
+        if len(payload) < SMALL_PART and len(parts) > 1:
+            small = parts.pop()
+            if isinstance(parts[-1], bytearray):
+                parts[-1] += small
+            else:
+                parts.append(bytearray(small))
         self._check_pieces()
 
     def _check_pieces(self) -> None:

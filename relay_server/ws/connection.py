@@ -482,7 +482,9 @@ class ClientConnection(BoundedProtocol):
             super().onPing(payload)
 
     def onPong(self, payload: bytes) -> None:
-        """The answer to a ping."""
+        """The answer to a ping. Autobahn also passes on one that has just failed the connection."""
+        if self.failedByMe:
+            return
         if self._pacer is not None:
             self._pacer.probe_answered(bytes(payload))
         if self._handler is not None:

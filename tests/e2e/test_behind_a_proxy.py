@@ -34,7 +34,7 @@ API = "/api/v1/robots/rover"
 TEXT = "0123456789abcdef" * 131_072
 """2 MiB: more than nginx accepts by default."""
 
-REQUEST = 48 * 1024
+REQUEST = 40 * 1024
 ANSWER = 512 * 1024
 """Bytes of it in the answer of a service; a robot's JSON is at most a MiB."""
 

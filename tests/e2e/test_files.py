@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import random
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,9 +17,10 @@ from robot_client.offload import Device
 from tests.worlds.accessibility import violations
 from tests.worlds.browser import checked_pages, open_session
 from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.file_daemon import PRESSURE, file_daemon
 from tests.worlds.forked_programs import run_command
 from tests.worlds.http_requests import Answer, ask
-from tests.worlds.processes import BIN, Process, running
+from tests.worlds.processes import BIN, running
 from tests.worlds.relay_process import Relay
 from tests.worlds.waiting import wait_for
 
@@ -49,11 +48,6 @@ settle_seconds = 0.5
 after = "delete"
 when = "full"
 """
-PRESSURE = {
-    "SWITCHBOARD_ROBOT_OFFLOAD_CYCLE_SECONDS": "0.5",
-    "SWITCHBOARD_ROBOT_OFFLOAD_CRITICAL_MEMORY": "0",
-}
-"""Settings by which the memory of any machine is critical; without them nothing is (``tests/conftest.py``)."""
 
 
 class World:
@@ -78,9 +72,7 @@ class World:
         self.start_daemon()
 
     def start_daemon(self, **settings: str) -> None:
-        command = [sys.executable, "-m", "tests.worlds.file_daemon", str(self.state)]
-        env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **settings}
-        self.daemon = Process([*command, str(self.folder / "robot.toml")], self.folder, "daemon", env)
+        self.daemon = file_daemon(self.state, self.folder / "robot.toml", self.folder, **settings)
 
     def files(self, token: str = "") -> list[dict[str, Any]]:
         answer = ask(self.relay.http_port, "GET", FILES, token=token or self.ann)

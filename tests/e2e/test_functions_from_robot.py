@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ from robot_client.services.placement import CameraImage, RunOptions, file_of, ma
 from tests.robot_client.services.test_markers import LENS, SIZE, drawn
 from tests.worlds import offload_functions
 from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.file_daemon import PRESSURE, file_daemon
 from tests.worlds.forked_programs import run_command
+from tests.worlds.http_requests import ask
 from tests.worlds.processes import BIN, running
 from tests.worlds.relay_process import Relay
 from tests.worlds.waiting import wait_for
@@ -122,6 +125,32 @@ def test_a_function_runs_where_the_device_wants_it(world: RobotProgram) -> None:
         ("here", "the signal is too weak"),
         ("cloud", "forced"),
     ]
+
+
+def test_what_the_daemon_measures_sends_a_function_to_a_worker(world: RobotProgram, tmp_path: Path) -> None:
+    """From memory that is critical to the worker's result, and to the relay's view of the device."""
+    here = []
+
+    @offload("add", client=world.cloud, state=world.device, version=1)
+    def add(a: float, b: float = 1.0) -> float:
+        here.append(a)
+        return a + b
+
+    settings = tmp_path / "robot.toml"
+    settings.write_text("[safety]\nguard = false\n")
+    world.publish(memory=False)
+    with running(file_daemon(world.state, settings, tmp_path, **PRESSURE)):
+        wait_for("memory is critical", lambda: world.device.critical("memory"))
+        assert (add(6), here) == (7, [])
+        decision = decisions()[-1]
+        assert (decision.where, decision.why) == ("cloud", "memory critical")
+        admin = world.relay.user("root", admin=True)
+
+        def shown() -> Any:
+            answer = ask(world.relay.http_port, "GET", "/api/v1/robots/rover/device", token=admin)
+            return answer.status == 200 and answer.json["critical"]
+
+        wait_for("the relay knows", lambda: (shown() or {}).get("memory"))
 
 
 def test_without_the_relay_a_function_runs_here(world: RobotProgram, tmp_path: Path) -> None:

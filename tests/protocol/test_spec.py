@@ -234,7 +234,7 @@ def test_the_version_and_the_words_of_rights_are_the_codes() -> None:
         (f"1 to {limits.MAX_SAMPLE // limits.MIB} MiB", 1024),
         (f"message and frame from a client | {limits.CLIENT_MESSAGE // 10**6} MB", 10),
         (f"{limits.UNAUTHENTICATED_SECONDS:g} s, {limits.UNAUTHENTICATED_BYTES // limits.KIB} KiB", 64),
-        (f"body of a request | {limits.HTTP_BODY // limits.KIB} KiB", 56),
+        (f"body of a request | {limits.HTTP_BODY // limits.KIB} KiB", 48),
         (f"nesting of JSON | {limits.JSON_DEPTH}", 64),
         (f"all it contains | {limits.TYPE_DEFINITION // limits.KIB} KiB", 256),
         (f"type or node | {limits.NAME} characters", 255),

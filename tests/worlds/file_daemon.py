@@ -12,6 +12,26 @@ from robot_client.motion.stop_store import DiskStopStore
 from robot_client.run import DaemonProcess
 from robot_client.twisted_types import monotonic_reactor
 from tests.worlds.memory_platform import MemoryPlatform
+from tests.worlds.processes import Process
+
+PRESSURE = {
+    "SWITCHBOARD_ROBOT_OFFLOAD_CYCLE_SECONDS": "0.5",
+    "SWITCHBOARD_ROBOT_OFFLOAD_CRITICAL_MEMORY": "0",
+}
+"""Settings by which the memory of any machine is critical; without them nothing is (``tests/conftest.py``)."""
+
+
+def file_daemon(state: Path, settings: Path, folder: Path, **variables: str) -> Process:
+    """Starts such a daemon.
+
+    :param settings: the file of its settings
+    :param folder: for its output
+    :param variables: further settings, as environment variables
+    """
+    command = [sys.executable, "-m", "tests.worlds.file_daemon", str(state), str(settings)]
+    return Process(
+        command, folder, "daemon", {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **variables}
+    )
 
 
 def main() -> None:
