@@ -241,10 +241,15 @@ class Monitors:
 
     def _battery(self, robot: RobotState) -> None:
         charge, at = robot.health.battery, self._thresholds
-        if charge is None or not at.battery_low:
+        if not at.battery_low:
+            return
+        lasts = self._sink.level_of(robot, kinds.BATTERY)
+        if robot.impossible_charge is not None and lasts is None:
+            said = f"the robot reports a charge of {robot.impossible_charge:g}, which is not from 0 to 1"
+            self._sink.raise_alert(robot, kinds.BATTERY, "", "warning", f"{said}; it counts as unknown")
+        if charge is None:
             return
         level = "error" if charge <= at.battery_critical else "warning" if charge <= at.battery_low else ""
-        lasts = self._sink.level_of(robot, kinds.BATTERY)
         if level and (lasts is None or kinds.severity(level) > kinds.severity(lasts)):
             self._sink.raise_alert(robot, kinds.BATTERY, "", level, f"the battery is at {charge:.0%}")
         elif lasts is not None and charge >= max(at.battery_low, at.battery_critical) + BATTERY_STEP:

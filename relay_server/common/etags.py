@@ -31,12 +31,12 @@ _COMPRESSED = re.compile(r"(?:--?|;)(?:gzip|deflate|br|zstd)\Z")
 """What proxies that compress an answer append to its tag: Apache, Caddy, Jetty and others."""
 
 
-def as_given(tags: Iterable[str]) -> frozenset[str]:
+def as_given(tags: Iterable[str | None]) -> frozenset[str]:
     """Tags of a request, also as the relay gave them to a proxy that compresses.
 
-    :param tags: without ``W/`` and quotation marks
+    :param tags: without ``W/`` and quotation marks; werkzeug has ``None`` for the empty tag, which no state has
     """
-    return frozenset(form for each in tags for form in (each, _COMPRESSED.sub("", each)))
+    return frozenset(form for each in tags if each for form in (each, _COMPRESSED.sub("", each)))
 
 
 def names(header: str, etag: str) -> bool:

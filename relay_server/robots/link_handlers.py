@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import msgspec
 from sqlalchemy.orm import Session
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
@@ -376,6 +377,12 @@ class ControlLinkHandler(LinkHandler):
     def _publish(self, kind: str, **data: Any) -> None:
         self._context.bus.publish(kind, self._robot.robot_id, **data)
 
+    def _take_health(self, health: link.Health) -> None:
+        charge = health.battery
+        possible = charge is None or 0 <= charge <= 1
+        self._robot.impossible_charge = None if possible else charge
+        self._robot.health = health if possible else msgspec.structs.replace(health, battery=None)
+
     def message(self, body: bytes) -> None:
         """The robot sends its state."""
         self._context.robots.seen(self._robot)
@@ -383,7 +390,7 @@ class ControlLinkHandler(LinkHandler):
         if isinstance(message, link.Graph):
             self._context.robots.graph(self._robot, message)
         elif isinstance(message, link.Health):
-            self._robot.health = message
+            self._take_health(message)
             self._context.robots.changed()
         elif isinstance(message, link.DeviceReport):
             self._robot.device = message

@@ -238,6 +238,8 @@ class RobotState:
     encodings: tuple[str, ...] = ()
     description: link.Describe = field(default_factory=link.Describe)
     health: link.Health = field(default_factory=link.Health)
+    impossible_charge: float | None = None
+    """A battery's charge that the robot reports and that is not from 0 to 1; ``health`` has it as unknown."""
     device: link.DeviceReport | None = None
     motion_state: link.MotionState = field(default_factory=link.MotionState)
     cameras: tuple[link.Camera, ...] = ()
@@ -362,6 +364,7 @@ class RobotRegistry:
         robot.cameras = ()
         robot.graph.clear()
         robot.health = link.Health()
+        robot.impossible_charge = None
         robot.device = None
         robot.rtt = None
         robot.online_since = self._wall()

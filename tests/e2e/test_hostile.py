@@ -465,8 +465,8 @@ def test_a_request_that_is_too_big_is_refused_with_a_reason(world: Any, announce
             while data := plain.recv(65536):
                 answer += data
     assert answer.startswith(b"HTTP/1.1 413")
-    assert b"at most 57344 bytes" in answer
-    logs(world, "at most 57344 bytes", since)
+    assert b"at most %d bytes" % limits.HTTP_BODY in answer
+    logs(world, f"at most {limits.HTTP_BODY} bytes", since)
 
 
 def test_connections_that_came_and_went_are_not_held_against_an_address(world: Any) -> None:

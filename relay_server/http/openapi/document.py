@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 
+from relay_protocol import limits
 from relay_server.http.openapi.operation import (
     JSON,
     PROBLEM,
@@ -39,14 +40,14 @@ IN_PATHS = {
 }
 """Descriptions of path parameters."""
 
-ABOUT = """\
+ABOUT = f"""\
 Robots and clients connect to the relay. Live data comes by websocket (rosbridge v2); everything else is here.
 
 Names, units and meanings are those of the protocol's specification (SPEC 1.1 to 1.24). Every error is \
-problem details (RFC 9457); `detail` is for people. A request of more than 56 KiB gets 413, one that has not arrived \
-completely within 10 s gets 408. `HEAD` works wherever `GET` does; that of a stream ends at once. `RateLimit` and \
-`RateLimit-Policy` show the limit of a user, or of a network without credentials. Requests over the limit get 429 with \
-`Retry-After`. A stop is never rate limited."""
+problem details (RFC 9457); `detail` is for people. A request of more than {limits.HTTP_BODY // limits.KIB} KiB \
+gets 413, one that has not arrived completely within 10 s gets 408. `HEAD` works wherever `GET` does; that of a \
+stream ends at once. `RateLimit` and `RateLimit-Policy` show the limit of a user, or of a network without \
+credentials. Requests over the limit get 429 with `Retry-After`. A stop is never rate limited."""
 
 TAGS = {
     "session": "Login, logout and tickets",

@@ -162,6 +162,17 @@ def test_a_battery_is_low_critical_and_well_again_with_hysteresis(scene: Scene) 
     assert scene.sink.reported == ["battery warning", "battery error", "battery over", "battery warning"]
 
 
+def test_a_charge_that_is_none_raises_one_alert_until_there_is_a_right_one(scene: Scene) -> None:
+    scene.world.robot_comes()
+    scene.world.robot.impossible_charge = 57.0
+    scene.goes_on(3)
+    assert scene.sink.reported == ["battery warning"]
+    scene.world.robot.impossible_charge = None
+    scene.world.robot.health = link.Health(battery=0.57)
+    scene.goes_on(1)
+    assert scene.sink.reported == ["battery warning", "battery over"]
+
+
 def test_batteries_are_not_looked_at_where_that_is_switched_off(scene: Scene) -> None:
     scene.monitors = Monitors(
         scene.world.registry,
@@ -172,6 +183,7 @@ def test_batteries_are_not_looked_at_where_that_is_switched_off(scene: Scene) ->
     )
     scene.world.robot_comes()
     scene.world.robot.health = link.Health(battery=0.0)
+    scene.world.robot.impossible_charge = -1.0
     scene.goes_on(3)
     assert scene.sink.reported == []
 

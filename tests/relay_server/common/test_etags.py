@@ -16,6 +16,7 @@ BARE = TAG.strip('"')
         "*",
         TAG,
         f'"x", {TAG}',
+        f'"", {TAG}',
         weak(TAG),
         f'"{BARE}-gzip"',
         f'W/"{BARE}-br"',
@@ -29,7 +30,10 @@ def test_a_state_that_the_client_has_matches(match: str) -> None:
     check_match(weak(TAG), match)
 
 
-@pytest.mark.parametrize("match", ["", '"x"', f'"{BARE}x"', f'"{BARE}-gzip-x"', f'"x{BARE}"', '"-gzip"'])
+@pytest.mark.parametrize(
+    "match",
+    ["", '""', 'W/""', f'"", "x{BARE}"', '"x"', f'"{BARE}x"', f'"{BARE}-gzip-x"', f'"x{BARE}"', '"-gzip"'],
+)
 def test_any_other_does_not(match: str) -> None:
     with pytest.raises(PreconditionFailed):
         check_match(TAG, match)

@@ -329,6 +329,21 @@ async def test_description_of_a_robot_is_stored(scene: RobotLinkWorld) -> None:
     assert (presence.description.host, presence.graph.nodes, presence.health.battery) == ("shed", {"/n"}, 0.5)
 
 
+@pytest.mark.parametrize("charge", [57.0, -1.0, 1.01])
+@pytest_twisted.ensureDeferred
+async def test_a_charge_that_is_not_from_0_to_1_counts_as_unknown(
+    scene: RobotLinkWorld, charge: float
+) -> None:
+    robot = await scene.registered()
+    robot.says(link.Health(battery=charge, cpu=0.5))
+    presence = scene.presence
+    assert presence is not None
+    assert (presence.health.battery, presence.health.cpu) == (None, 0.5)
+    assert presence.impossible_charge == charge
+    robot.says(link.Health(battery=1.0))
+    assert (presence.health.battery, presence.impossible_charge) == (1.0, None)
+
+
 @pytest.mark.parametrize("op", ["graph", "alert"])
 @pytest_twisted.ensureDeferred
 async def test_a_control_link_takes_no_large_frame(scene: RobotLinkWorld, op: str) -> None:

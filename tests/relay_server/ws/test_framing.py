@@ -10,9 +10,10 @@ from typing import NamedTuple
 import pytest
 from websockets.utils import apply_mask
 
+from relay_server.common import close_codes
 from tests.worlds.websocket_client import Client, MemoryGate
 
-CONT, TEXT, CLOSE, PING, PONG = 0x0, 0x1, 0x8, 0x9, 0xA
+CONT, TEXT, BINARY, CLOSE, PING, PONG = 0x0, 0x1, 0x2, 0x8, 0x9, 0xA
 FIN = 0x80
 PROTOCOL_ERROR = 1002
 MASK = b"\x37\xfa\x21\x3d"
@@ -68,6 +69,13 @@ SIZES = (0, 1, 125, 126, 127, 128, 4096, 4097, 65_535, 65_536, 65_537, 300_000)
 BYTES = bytes(range(256))[:125]
 
 WHOLE = {f"1.1: a text of {size}": Case([frame(TEXT, b"*" * size)], [b"*" * size]) for size in SIZES}
+
+BINARIES = {
+    f"1.2: {size} bytes, which are no rosbridge": Case(
+        [frame(BINARY, b"*" * size)], closed=close_codes.FORBIDDEN
+    )
+    for size in (0, 125, 126, 65_536)
+}
 
 CONTROL = {
     "2.1: a ping without a payload": Case([frame(PING)], pongs=[b""]),
@@ -166,7 +174,7 @@ LENGTHS = {
     "a ping that is not masked": Case([b"\x89\x00" + bytes(14)], closed=PROTOCOL_ERROR),
 }
 
-CASES = {**WHOLE, **CONTROL, **RESERVED, **OPCODES, **FRAGMENTS, **LENGTHS}
+CASES = {**WHOLE, **BINARIES, **CONTROL, **RESERVED, **OPCODES, **FRAGMENTS, **LENGTHS}
 
 
 @pytest.mark.parametrize("division", DIVISIONS)

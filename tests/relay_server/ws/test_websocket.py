@@ -644,6 +644,20 @@ def test_a_close_of_the_client_is_answered(gate: MemoryGate, code: int) -> None:
     assert gate.sessions[0].orderly
 
 
+@pytest.mark.parametrize("payload", [b"", b"\x03\xe8", b"\x03\xe8" + b"*" * 122, b"\x03\xe8" + b"*" * 123])
+def test_a_close_of_the_client_may_have_no_code_and_a_long_reason(gate: MemoryGate, payload: bytes) -> None:
+    """A reason has at most 123 octets (RFC 6455 section 5.5); what follows a close is not read."""
+    client = Client(gate, Authorization="Bearer good")
+    client.core.writes.append(Frame(Opcode.CLOSE, payload).serialize(mask=True))
+    client.core.writes.append(Frame(Opcode.TEXT, b"late").serialize(mask=True))
+    client.core.writes.append(Frame(Opcode.PING, b"late").serialize(mask=True))
+    client.run()
+    assert client.core.close_rcvd is not None
+    assert gate.sessions[0].got == ["start", "end"]
+    assert gate.sessions[0].orderly
+    assert client.pongs == []
+
+
 def test_no_session_begins_on_a_connection_that_has_failed(gate: MemoryGate) -> None:
     """The token may be accepted before the client has answered the close frame."""
     gate.wait = Deferred()
