@@ -56,6 +56,10 @@ class ButtonLayout(NamedTuple):
     back: int
 
 
+def _controls(pad: Any) -> int:
+    return int(pad.get_numaxes() + pad.get_numbuttons())
+
+
 class Gamepads:
     """The first gamepad whose layout is known; one that is unplugged is gone, and the next one counts.
 
@@ -92,10 +96,10 @@ class Gamepads:
         if pad is None or not pad.get_init():
             return ""
         pressed = " ".join(str(button) for button in range(pad.get_numbuttons()) if pad.get_button(button))
-        return (
-            f"the layout of {pad.get_name()} is not known; "
-            f"give --axes and --buttons (pressed: {pressed or 'no button'})"
-        )
+        pressed = f"(pressed: {pressed or 'no button'})"
+        if self._layout is not None:
+            return f"{pad.get_name()} lacks axes or buttons of --axes and --buttons {pressed}"
+        return f"the layout of {pad.get_name()} is not known; give --axes and --buttons {pressed}"
 
     def read(self) -> GamepadState | None:
         """Its state now."""
@@ -127,10 +131,22 @@ class Gamepads:
         self._known = known is not None
         if known is not None:
             self._open = self._controller.Controller(known)
-        elif devices and self._layout is not None:
-            self._open = self._pygame.joystick.Joystick(0)
-        unknown = self._open is None and len(devices) > 0
-        self._unknown = self._pygame.joystick.Joystick(0) if unknown else None
+            self._unknown = None
+            return
+        # Some devices report themselves as a joystick without axes or buttons.
+        pads = sorted(map(self._pygame.joystick.Joystick, devices), key=_controls, reverse=True)
+        self._open = next((pad for pad in pads if self._fits(pad)), None)
+        self._unknown = pads[0] if pads and self._open is None else None
+        for pad in pads:
+            if pad not in (self._open, self._unknown):
+                pad.quit()
+
+    def _fits(self, pad: Any) -> bool:
+        layout = self._layout
+        if layout is None:
+            return False
+        axes, buttons = max(layout.ahead, layout.left), max(layout.hold, layout.stop, layout.back)
+        return bool(axes < pad.get_numaxes() and buttons < pad.get_numbuttons())
 
     def _read_controller(self) -> GamepadState:
         pygame, pad = self._pygame, self._open

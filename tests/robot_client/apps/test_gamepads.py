@@ -35,9 +35,9 @@ def sdl(monkeypatch: pytest.MonkeyPatch) -> Iterator[ctypes.CDLL]:
     pygame.quit()
 
 
-def plug(sdl: ctypes.CDLL, kind: int = UNKNOWN) -> int:
+def plug(sdl: ctypes.CDLL, kind: int = UNKNOWN, axes: int = 6, buttons: int = 15) -> int:
     """Plugs in another gamepad; returns its number."""
-    number = int(sdl.SDL_JoystickAttachVirtual(kind, 6, 15, 0))
+    number = int(sdl.SDL_JoystickAttachVirtual(kind, axes, buttons, 0))
     assert number >= 0
     return number
 
@@ -100,4 +100,17 @@ def test_an_unknown_device_in_the_first_slot_does_not_hide_a_gamepad(
     assert gamepads.read() == LOOSE
     assert gamepads.problem == ""
     press(sdl, number, 10)
+    assert gamepads.read() == LOOSE._replace(pressed=True)
+
+
+def test_a_device_without_the_axes_of_the_layout_does_not_hide_a_pad_that_has_them(sdl: ctypes.CDLL) -> None:
+    """Neither of them is known to SDL."""
+    gamepads = Gamepads(LAYOUT)
+    plug(sdl, axes=1, buttons=1)
+    assert gamepads.read() is None
+    assert "lacks axes or buttons of --axes and --buttons" in gamepads.problem
+    number = plug(sdl)
+    assert gamepads.read() == LOOSE
+    assert gamepads.problem == ""
+    press(sdl, number, LAYOUT.hold)
     assert gamepads.read() == LOOSE._replace(pressed=True)
