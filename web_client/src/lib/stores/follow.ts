@@ -3,33 +3,49 @@
 const FIRST_PAUSE_MS = 1000
 const LONGEST_PAUSE_MS = 15_000
 
-/** Runs `stream` again and again until the returned function is called.
+/** Runs `stream` again and again while the page is visible, until the returned function is called.
+ *
+ * A hidden page follows nothing: each stream holds one of the few connections that a browser opens to one relay.
  *
  * @param stream ends when its signal does
  * @param failed gets the reason when a stream could not be opened or broke off
  */
 export function keepFollowing(stream: (signal: AbortSignal) => Promise<void>, failed: (reason: string) => void): () => void {
-  const ending = new AbortController()
+  let running = new AbortController()
   let timer: ReturnType<typeof setTimeout> | undefined
   let pause = FIRST_PAUSE_MS
 
   async function run() {
+    const { signal } = (running = new AbortController())
     const began = performance.now()
     try {
-      await stream(ending.signal)
+      await stream(signal)
     } catch (error) {
-      if (ending.signal.aborted) return
+      if (signal.aborted) return
       failed(error instanceof Error ? error.message : String(error))
     }
-    if (ending.signal.aborted) return
+    if (signal.aborted) return
     pause = performance.now() - began > LONGEST_PAUSE_MS ? FIRST_PAUSE_MS : Math.min(LONGEST_PAUSE_MS, pause * 2)
     timer = setTimeout(() => void run(), pause)
   }
 
-  void run()
-  return () => {
-    ending.abort()
+  function end() {
+    running.abort()
     clearTimeout(timer)
+  }
+
+  function begin() {
+    end()
+    if (document.visibilityState === 'hidden') return
+    pause = FIRST_PAUSE_MS
+    void run()
+  }
+
+  begin()
+  document.addEventListener('visibilitychange', begin)
+  return () => {
+    document.removeEventListener('visibilitychange', begin)
+    end()
   }
 }
 
