@@ -33,7 +33,7 @@ class Lost(Exception):
 class RosbridgeConnection:
     """Sends and receives rosbridge messages of one robot.
 
-    :param connection: a websocket of the ``websockets`` library
+    :param connection: a :class:`robot_client.apps.blocking_websocket.BlockingWebsocket`
     """
 
     def __init__(self, connection: Any) -> None:
@@ -120,11 +120,12 @@ def connected(url: str) -> Iterator[RosbridgeConnection]:
     :raises Refused: the relay refuses, and a retry does not help
     """
     from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
-    from websockets.sync.client import connect
+
+    from robot_client.apps.blocking_websocket import BlockingWebsocket
 
     headers = {"Authorization": f"Bearer {access_token()}"}
     try:
-        with connect(url, additional_headers=headers, close_timeout=CLOSE_SECONDS) as websocket:
+        with BlockingWebsocket(url, additional_headers=headers, close_timeout=CLOSE_SECONDS) as websocket:
             yield RosbridgeConnection(websocket)
     except InvalidURI as error:
         raise Refused(f"{url} is not the address of a robot: {error}") from None

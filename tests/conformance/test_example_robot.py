@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from robots_under_test import EXAMPLE, SENSOR
-from websockets.sync.client import connect
 
+from robot_client.apps.blocking_websocket import BlockingWebsocket
 from tests.worlds.processes import Process
 from tests.worlds.relay_process import Relay
 from tests.worlds.sync_client import Client
@@ -199,7 +199,8 @@ def test_it_speaks_tls(tmp_path: Path) -> None:
         relay.cli("right", "grant", "driver", NAME, "operator")
         url, trust = relay.url(NAME).replace("ws:", "wss:"), ssl.create_default_context(cafile=cert)
         headers = {"Authorization": f"Bearer {token}"}
-        with Client(connect(url, ssl=trust, additional_headers=headers, close_timeout=1)) as client:
+        connecting = BlockingWebsocket(url, ssl=trust, additional_headers=headers, close_timeout=1)
+        with Client(connecting) as client:
             drive(client)
             wait_for("it stands", lambda: speed(client) == 0)
     finally:

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
+from robot_client.apps.blocking_websocket import BlockingWebsocket
 from tests.worlds.browser import portal
 from tests.worlds.certificates import Authority
 from tests.worlds.processes import running
@@ -82,7 +82,7 @@ class Site:
     def connect(self, query: str = "", **headers: str) -> Client:
         """A websocket to the robot."""
         return Client(
-            connect(
+            BlockingWebsocket(
                 f"wss://{HOST}/robots/rover{query}",
                 sock=self._dial(),
                 ssl=self.proxy.context,

@@ -7,14 +7,17 @@ import signal
 import socket
 import ssl
 import subprocess
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography import x509
-from websockets.sync.client import connect
 
 from relay_server import PORTAL
+from robot_client.apps.blocking_websocket import BlockingWebsocket
+from robot_client.apps.connection import TOKEN, connected
 from tests.worlds.certificates import DAY, Authority
 from tests.worlds.client_threads import Driver
 from tests.worlds.doc_examples import examples
@@ -50,7 +53,9 @@ class World:
         """A websocket over TLS."""
         url = f"wss://127.0.0.1:{self.relay.http_port}/robots/rover"
         headers = {"Authorization": f"Bearer {self.token}"}
-        return Client(connect(url, ssl=self.context, additional_headers=headers, open_timeout=PATIENCE))
+        return Client(
+            BlockingWebsocket(url, ssl=self.context, additional_headers=headers, open_timeout=PATIENCE)
+        )
 
     def reload(self, words: str) -> None:
         """Sends SIGHUP until the log has these words once more."""
@@ -144,6 +149,41 @@ def test_pipelined_requests_are_answered_in_order_over_tls(world: World) -> None
         while data := secure.recv(5000):
             received += data
     assert received.count(file.read_bytes()) == 4
+
+
+def test_a_program_reads_and_writes_tls_in_one_thread(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenSSL allows no more; otherwise a connection hangs now and then when a session ticket comes."""
+    threads: set[int] = set()
+
+    class Watched(ssl.SSLObject):
+        def read(self, *arguments: Any) -> Any:
+            threads.add(threading.get_ident())
+            return super().read(*arguments)
+
+        def write(self, data: Any) -> int:
+            threads.add(threading.get_ident())
+            return super().write(data)
+
+    class WatchedSocket(ssl.SSLSocket):
+        def read(self, *arguments: Any) -> Any:
+            threads.add(threading.get_ident())
+            return super().read(*arguments)
+
+        def sendall(self, *arguments: Any) -> None:
+            threads.add(threading.get_ident())
+            return super().sendall(*arguments)
+
+    monkeypatch.setattr(ssl.SSLContext, "sslobject_class", Watched)
+    monkeypatch.setattr(ssl.SSLContext, "sslsocket_class", WatchedSocket)
+    monkeypatch.setenv("SSL_CERT_FILE", str(world.authority.path))
+    monkeypatch.setenv(TOKEN, world.token)
+    with connected(f"wss://127.0.0.1:{world.relay.http_port}/robots/rover") as program:
+        number = program.call("/relay/ping")
+        while (answer := program.receive(PATIENCE)) is not None and answer.get("id") != number:
+            pass
+        assert answer is not None
+        assert answer["result"]
+    assert len(threads) == 1
 
 
 def test_robot_that_does_not_trust_the_ca_does_not_connect(world: World) -> None:
