@@ -1,4 +1,4 @@
-"""Shared by all tests: programs are forked; slow files start first, so that all workers end together."""
+"""Shared by all tests: programs are forked; slow files start first, so that all workers end together; none is endless."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.durations import Durations, ProcessorSeconds, file_of
+from tests.time_limit import SECONDS as TEST_SECONDS
+from tests.time_limit import TimeLimit
 from tests.worlds import processes
 
 processes.forking = True
@@ -35,6 +37,7 @@ def pytest_configure(config: pytest.Config) -> None:
     gc.disable()
     processor = ProcessorSeconds(config)
     config.pluginmanager.register(processor)
+    config.pluginmanager.register(TimeLimit(TEST_SECONDS))
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(Durations(processor))
 
