@@ -1,4 +1,4 @@
-"""Shared by all tests: programs are forked; slow files start first, so that all workers end together; none is endless."""
+"""Shared by all tests: programs are forked, slow files start first, and a test that never ends fails."""
 
 from __future__ import annotations
 
