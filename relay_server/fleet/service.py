@@ -29,6 +29,7 @@ from relay_server.common.database import AsyncDatabase
 from relay_server.common.token_bucket import Buckets
 from relay_server.control.actor import Actor, user_actor
 from relay_server.control.service import ControlService
+from relay_server.control.stopping import StopIds
 from relay_server.events.bus import EventBus
 from relay_server.fleet.order import (
     GROUP,
@@ -109,10 +110,17 @@ class FleetPlan:
     def age(self) -> OrderAge:
         return OrderAge(self.order, self.earliest_sent)
 
+    @property
+    def sender(self) -> Actor:
+        """The user, by the name in their own realm."""
+        if _is_local(self.principal):
+            return Actor(LOCAL.name, "cli", address=self.address)
+        return user_actor(self.principal.name, self.principal.user_id, self.address)
+
     def actor(self, robot: RobotState) -> Actor:
         """The user, as a robot's audit entries name them."""
         if _is_local(self.principal):
-            return Actor(LOCAL.name, "cli", address=self.address)
+            return self.sender
         name = robot.name_of(self.principal.name, self.principal.realm)
         return user_actor(name, self.principal.user_id, self.address)
 
@@ -162,6 +170,7 @@ class FleetService:
         self._clock_ns = clock_ns
         self._wall = wall
         self._orders: Counter[int] = Counter()
+        self._ids = StopIds()
         self._stops = Buckets(STOPS_PER_SECOND, STOPS_BURST, STOP_USERS, clock.seconds)
 
     async def groups(self, principal: Principal) -> list[RobotGroupInfo]:
@@ -292,14 +301,18 @@ class FleetService:
 
         if plan.order.do == "stop":
             on_begin()
-            await begun(self._stop(plan, one))
+            if self._ids.is_duplicate(plan.sender, plan.order.stop_id):
+                # The other path of the same press reports it.
+                await self._stop(plan, one, audited=True)
+            else:
+                await begun(self._stop(plan, one, audited=False))
             return
         with self._order_slot(plan.principal):
             await self._write_audit(plan)
             on_begin()
             await begun(bounded_gather(plan.robots, one))
 
-    async def _stop(self, plan: FleetPlan, one: Callable[[str], Awaitable[None]]) -> None:
+    async def _stop(self, plan: FleetPlan, one: Callable[[str], Awaitable[None]], *, audited: bool) -> None:
         """Robots that are online are stopped at once, and only then is the audit entry written."""
         online = [
             name
@@ -309,7 +322,7 @@ class FleetService:
         # The plan has just looked up the rights on these. The others are judged when their turn comes.
         stopping = Deferred.fromCoroutine(bounded_gather(online, one, at_once=len(online)))
         try:
-            if self._stops.take(plan.principal.user_id):
+            if not audited and self._stops.take(plan.principal.user_id):
                 self._audit.append(self._audit_entry(plan))
         finally:
             # The stops are finished even if the client has hung up.

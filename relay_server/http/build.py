@@ -21,6 +21,7 @@ from relay_server.core import Core
 from relay_server.events.http import EventEndpoints
 from relay_server.files.http import FileEndpoints
 from relay_server.fleet.http import FleetEndpoints
+from relay_server.fleet.websocket_stops import WebsocketStops
 from relay_server.foxglove_urls.http import FoxgloveUrlEndpoints
 from relay_server.http.authentication import RequestAuthenticator
 from relay_server.http.cross_origin import CrossOrigin
@@ -113,7 +114,8 @@ def build_http(services: Services, local: IResource) -> HttpSite:
     router = Router(authenticator, core.freshness, forwarding)
     router.add(*_endpoints(services, sources), *_robot_endpoints(services))
     timing = services.sessions.timing
-    updates = UpdatesAuth(core.reactor, services.auth, timing, core.origins, core.cookie, sources)
+    stops = WebsocketStops(core.reactor, services.fleet)
+    updates = UpdatesAuth(core.reactor, services.auth, timing, core.origins, core.cookie, sources, stops)
     programs = _programs(services)
     connections = ConnectionLimits(settings.connections)
     root = _root(services, router, updates, programs, connections, limits, forwarding)

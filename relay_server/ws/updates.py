@@ -1,4 +1,4 @@
-"""Updates of a page over a websocket (``/api/v1/robots/stream``, SPEC 1.7).
+"""Updates of a page over a websocket, and its stops of many robots (``/api/v1/robots/stream``, SPEC 1.7).
 
 Browsers allow six HTTP/1.1 connections to a host, for all tabs together, and a stream of server-sent events keeps one
 of them. They allow hundreds of websockets. Authentication and closing are as for every client's websocket.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from autobahn.websocket.types import ConnectionRequest
 from twisted.internet.defer import CancelledError, Deferred
@@ -26,8 +26,11 @@ from relay_server.sessions.ports import ClientTransport, Timing
 from relay_server.ws.connection import ClientConnection, ClientFactory
 from relay_server.ws.handshake import code_of
 
-MESSAGE_BYTES = 125
-"""Largest message that is read. A page has nothing to send."""
+MESSAGE_BYTES = 4096
+"""Largest message that is read. A page sends only orders to stop."""
+
+STOPS = 8
+"""Orders to stop of one page at a time."""
 
 
 class UpdatesTokens(Protocol):
@@ -35,6 +38,22 @@ class UpdatesTokens(Protocol):
 
     async def token(self, token: str) -> Principal:
         """The principal of a token."""
+
+
+class PageStops(Protocol):
+    """Stops many robots; see :class:`relay_server.fleet.websocket_stops.WebsocketStops`."""
+
+    async def carry_out(
+        self, principal: Principal, payload: bytes, address: str, send: Callable[[bytes], None]
+    ) -> None:
+        """Carry out one order, and send the lines of its answer."""
+
+
+class PageAdmission(NamedTuple):
+    """Who opens a page, and where."""
+
+    principal: TokenPrincipal
+    address: str
 
 
 @dataclass(frozen=True)
@@ -60,12 +79,14 @@ class UpdatesAuth:
         origins: Origins,
         cookie: str,
         sources: Sources,
+        stops: PageStops,
     ) -> None:
         self.accepting = True
         self.clock = clock
         self.tokens = tokens
         self.timing = timing
         self.sources = sources
+        self.stops = stops
         self.rounds = PeriodicTimers(clock)
         self._origins = origins
         self._cookie = cookie
@@ -92,11 +113,12 @@ class UpdatesAuth:
 
     async def admit(self, principal: Principal, robot: str, address: str) -> Any:
         """Every user may follow their robots, even without any. :meth:`open` takes the result."""
-        return principal
+        assert isinstance(principal, TokenPrincipal)
+        return PageAdmission(principal, address)
 
     def open(self, admission: Any, transport: ClientTransport, opened_ns: int) -> UpdatesClient:
         """Begin to send updates to an authorized principal."""
-        client = UpdatesClient(self, transport, admission.token, self._open.discard)
+        client = UpdatesClient(self, transport, admission, self._open.discard)
         self._open.add(client)
         return client
 
@@ -117,7 +139,7 @@ class UpdatesAuth:
 class UpdatesClient:
     """The websocket of one page.
 
-    :param token: the access token of its user
+    :param admission: its user
     :param ended: called when the websocket is closed
     """
 
@@ -129,7 +151,7 @@ class UpdatesClient:
         self,
         auth: UpdatesAuth,
         transport: ClientTransport,
-        token: str,
+        admission: PageAdmission,
         ended: Callable[[UpdatesClient], None],
     ) -> None:
         self.send_queue = SendQueue(transport.send, auth.clock.seconds, self.cut)
@@ -139,7 +161,11 @@ class UpdatesClient:
         self._timing = auth.timing
         self._transport = transport
         self._ended = ended
+        self._admission = admission
+        token = admission.principal.token
         self._updates = LiveUpdates(auth.clock, self, lambda: auth.tokens.token(token), auth.sources)
+        self._stops = auth.stops
+        self._stopping = 0
         self._running: Deferred[None] | None = None
         self._pinging = PeriodicTimer(self._ping, self._timing.client_ping)
         self._last_pong = auth.clock.seconds()
@@ -154,10 +180,20 @@ class UpdatesClient:
         self._running.addErrback(self._over)
 
     def message(self, payload: bytes, *, earliest_sent: int | None = None) -> None:
-        """Close: this websocket takes no messages."""
-        self.close(
-            close_codes.INVALID, "this websocket takes no messages; updates are sent without a request"
-        )
+        """Carry out an order to stop; it continues when the websocket is closed."""
+        if self._stopping == STOPS:
+            self.close(close_codes.TOO_MANY_ERRORS, f"at most {STOPS} orders to stop at a time")
+            return
+        self._stopping += 1
+        stopping = Deferred.fromCoroutine(self._stop(payload))
+        stopping.addErrback(self._over)
+
+    async def _stop(self, payload: bytes) -> None:
+        principal, address = self._admission
+        try:
+            await self._stops.carry_out(principal, payload, address, lambda line: self.send("order", line))
+        finally:
+            self._stopping -= 1
 
     def ping(self) -> None:
         """Send a ping now."""
@@ -222,7 +258,7 @@ class UpdatesClient:
         if isinstance(error, SwitchboardError):
             self.close(code_of(error), str(error))
         elif not isinstance(error, CancelledError):
-            self.log.failure("sending updates to a page failed", failure)
+            self.log.failure("serving a page failed", failure)
             self.close(close_codes.INTERNAL, "the relay failed; see its log")
 
     def _ping(self) -> None:

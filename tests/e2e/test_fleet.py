@@ -11,11 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from tests.worlds.http_requests import Answer, ask
 from tests.worlds.processes import Process, ros_environment
 from tests.worlds.relay_process import Relay
 from tests.worlds.small_robot import SmallRobot
+from tests.worlds.sync_client import Client
 from tests.worlds.waiting import PATIENCE, wait_for
 
 CLEANERS = ("cleaner-1", "cleaner-2", "cleaner-3")
@@ -219,6 +222,41 @@ def test_a_stop_is_stored_for_robots_that_are_offline(fleet: Fleet) -> None:
     finally:
         three.goes()
         wait_for("it is offline again", lambda: fleet.relay.state_of("cleaner-3") == "offline")
+
+
+def test_a_stop_by_websocket_and_by_http_is_one(fleet: Fleet) -> None:
+    """A page sends it by both, as its requests may wait for a connection."""
+    one = fleet.robots["cleaner-1"]
+    order = {"robots": ["cleaner-*"], "do": "stop", "why": "a press", "stop_id": "press-1"}
+    url = f"ws://127.0.0.1:{fleet.relay.http_port}/api/v1/robots/stream"
+    with Client(connect(url, additional_headers={"Authorization": f"Bearer {fleet.ann}"})) as page:
+        page.send(**order)
+        lines = [page.until(event="order")["data"] for _ in range(5)]
+        assert lines[0]["robots"] == list(CLEANERS)
+        assert {each["robot"] for each in lines[1:4]} == set(CLEANERS)
+        assert (lines[4]["done"], lines[4]["ok"]) == (True, 3)
+        assert one.stopped == {"by": "ann", "why": "a press"}
+        results = fleet.results(fleet.ann, **order)
+        assert all(each["ok"] for each in results.values())
+        page.send(robots=["no-such"], do="stop")
+        with pytest.raises(ConnectionClosed) as closed:
+            page.until(event="order")
+        assert closed.value.rcvd is not None
+        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (
+            4404,
+            "the order matches no robot that you have a right on",
+        )
+    with Client(connect(url, additional_headers={"Authorization": f"Bearer {fleet.ann}"})) as page:
+        page.send(robots=["*"], do="call", service="/start")
+        with pytest.raises(ConnectionClosed) as closed:
+            page.until(event="order")
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 4400
+    audited = fleet.relay.cli("audit", "list", "--limit", "1000")
+    reasons = [each["data"]["why"] for each in audited if each["action"] == "fleet.stop"]
+    assert reasons.count("a press") == 1
+    fleet.results(fleet.bob, robots=["cleaner-*"], do="resume")
+    assert one.stopped is None
 
 
 def test_a_message_is_published_once(fleet: Fleet) -> None:

@@ -17,7 +17,7 @@ import mimetypes
 import secrets
 import time
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from email.utils import formatdate
 from fractions import Fraction
 from pathlib import Path
@@ -278,16 +278,17 @@ class Relay:
         """An order of a test: close, level, silent (no data), mute (no status), frozen (no answers), say,
         offline, dead (the robot answers no ping), gone (a topic that has ended).
 
-        Of HTTP: stuck (requests without an answer until they are released: "session", "orders"), failing (the
-        session cannot be looked up). Of the stream of pages: blind (it sends nothing), broken (there is
-        none), unknown (why it has no data). Of control: take_away, stopped (the user; told: whether the robot
-        has received it), resumed, grace (seconds), deny (the reason), fault (the failed part of a stop),
-        implicit (whether a command took it), suppressed and inhibited (as published). Of navigation, for
-        rover-1: navigation (it has Nav2), no_path (there is no path to any goal), waits (it does not drive on
-        while it has reached so many targets of its goal). Of alerts: alert, see ``Alerts.put``. Of video:
-        close_video, reduced (a slow link), instead (differing parameters of another format), ahead (seconds by
-        which the robot's clock is wrong), kept (age in seconds of the only frame for a new viewer; null: there
-        are new ones), source_fps. Of recordings: see ``Recordings.do``.
+        Of HTTP: stuck (without an answer until they are released: the requests "session" and "orders", and
+        "pages", orders by websocket), failing (the session cannot be looked up). Of the stream of pages:
+        blind (it sends nothing), broken (there is none), unknown (why it has no data). Of control:
+        take_away, stopped (the user; told: whether the robot has received it), resumed, grace (seconds),
+        deny (the reason), fault (the failed part of a stop), implicit (whether a command took it),
+        suppressed and inhibited (as published). Of navigation, for rover-1: navigation (it has Nav2),
+        no_path (there is no path to any goal), waits (it does not drive on while it has reached so many
+        targets of its goal). Of alerts: alert, see ``Alerts.put``. Of video: close_video, reduced (a slow
+        link), instead (differing parameters of another format), ahead (seconds by which the robot's clock
+        is wrong), kept (age in seconds of the only frame for a new viewer; null: there are new ones),
+        source_fps. Of recordings: see ``Recordings.do``.
         """
         self.recordings.do(order)
         self.silent = order.get("silent", self.silent)
@@ -728,8 +729,7 @@ class Connection:
         elif parts[0] == "alerts":
             self.reply(200, self.relay.alerts.acknowledge(parts[1], user))
         elif parts[0] == "fleet":
-            found = meant(ask["robots"], list(self.relay.rights[user]))
-            lines = fleet_answer(ask, *found, lambda robot: self.order(user, robot, ask["do"], ask))
+            lines = self.fleet_lines(user, ask)
             self.reply(
                 200, "".join(f"{json.dumps(line)}\n" for line in lines).encode(), "application/x-ndjson"
             )
@@ -739,6 +739,10 @@ class Connection:
             self.problem(409, done["message"])
         else:
             self.problem(403, "Only who has control, or an owner, may do that.")
+
+    def fleet_lines(self, user: str, ask: Json) -> Iterator[Json]:
+        found = meant(ask["robots"], list(self.relay.rights[user]))
+        return fleet_answer(ask, *found, lambda robot: self.order(user, robot, ask["do"], ask))
 
     def order(self, user: str, robot: str, what: str, ask: Json) -> Json:
         """Executed on one robot for all connections of a user."""
@@ -835,7 +839,7 @@ class Connection:
         """A page's stream."""
         user = self.user
         self.relay.log.append({"op": "follow", "by": user})
-        reading = asyncio.ensure_future(self.read(protocol))
+        reading = asyncio.ensure_future(self.read(protocol, user))
         while not reading.done() and not self.relay.broken:
             if user is None or self.user != user:
                 protocol.send_close(4401, "your session has ended; log in again")
@@ -852,10 +856,17 @@ class Connection:
         alerts = {"alerts": self.relay.alerts.streamed(list(self.relay.rights[user]))}
         return [("robots", self.relay.robot_list(user)), ("alerts", alerts)]
 
-    async def read(self, protocol: ServerProtocol) -> None:
+    async def read(self, protocol: ServerProtocol, user: str | None) -> None:
         while protocol.state is State.OPEN and (data := await self.reader.read(65536)):
             protocol.receive_data(data)
-            protocol.events_received()
+            for frame in protocol.events_received():
+                if getattr(frame, "opcode", None) is Opcode.TEXT and user is not None:
+                    await self.let_go("pages")
+                    ask = json.loads(frame.data)  # type: ignore[union-attr]
+                    self.relay.log.append({"user": user, "op": "page", **ask})
+                    for line in self.fleet_lines(user, ask):
+                        protocol.send_text(json.dumps({"event": "order", "data": line}).encode())
+                    self.flush(protocol)
 
     def flush(self, protocol: ServerProtocol) -> None:
         for data in protocol.data_to_send():

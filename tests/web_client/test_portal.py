@@ -182,6 +182,9 @@ class TestFleet:
         assert card.locator("img, b").count() == 0
 
 
+UNANSWERED_MS = 1000
+"""Until a stop without an answer is shown as not confirmed."""
+
 STOPPING = re.compile("^(Stopping…|Not confirmed)$")
 """The label of a stop button without an answer: the second one after a second."""
 
@@ -259,10 +262,16 @@ class TestStopAll:
         page = open_page("/fleet", user="admin")
         button = page.get_by_role("button", name="Stop all robots")
         expect(seen(page, "robot-card")).to_have_count(3)
-        relay.do(stuck=["orders"])
+        relay.do(stuck=["orders", "pages"])
         page.clock.install()
+        page.clock.pause_at(page.evaluate("Date.now()") + 1000)
         button.click()
-        expect(button).to_have_text(STOPPING)
+        expect(button).to_have_text("Stopping…")
+        page.clock.run_for(UNANSWERED_MS - 1)
+        expect(button).to_have_text("Stopping…")
+        page.clock.run_for(1)
+        expect(button).to_have_text("Not confirmed")
+        page.clock.resume()
         page.clock.fast_forward(23_000)
         expect(seen(page, "toast")).to_contain_text("It is unknown whether all robots are stopped.")
         expect(button).to_have_text("STOP all")
@@ -280,6 +289,18 @@ class TestStopAll:
         relay.do(robot="arm-3", stopped="ann")
         expect(state).to_have_text("Stopped")
         expect(seen(page, "toast")).to_have_count(0)
+
+    @pytest.mark.parametrize("blind", [False, True])
+    def test_where_no_request_gets_through(self, open_page: OpenPage, relay: FakeRelay, blind: bool) -> None:
+        """It is sent by a websocket too, whether or not the robots are known."""
+        relay.do(blind=blind, stuck=["orders"])
+        page = open_page("/fleet", user="admin")
+        if not blind:
+            expect(seen(page, "robot-card")).to_have_count(3)
+        page.get_by_role("button", name="Stop all robots").click()
+        expect(seen(page, "toast")).to_contain_text("2 robots are stopped.")
+        [asked] = relay.log(op="page")
+        assert (asked["do"], asked["robots"]) == ("stop", ["*"])
 
     def test_a_missing_answer_of_one_robot_is_shown(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """The same with the button of its card; an unconfirmed stop can be dismissed."""

@@ -224,7 +224,9 @@ class World:
         websocket = WebSocketUpgrade(
             ClientFactory(self.clock, lambda: 0, self.service, self.service, self.cap, limits)
         )  # type: ignore[arg-type]
-        self.pages = UpdatesAuth(self.clock, self.service, self.service.timing, origins, "sb", sources)
+        self.pages = UpdatesAuth(
+            self.clock, self.service, self.service.timing, origins, "sb", sources, cast(Any, None)
+        )
         pages = WebSocketUpgrade(
             UpdatesFactory(self.clock, lambda: 0, self.pages, self.pages, self.cap, limits)
         )

@@ -153,7 +153,7 @@ class Exchange:
             assert got.keys() == shown.keys()
             assert png_text(got["data"]) == png_text(shown["data"])
         else:
-            assert compact(json.loads(received)) == said
+            assert compact(json.loads(received)) == said, f"the client received {received!r}"
 
 
 __all__ = ["BLOCKS", "GRAPH", "Block", "Exchange", "blocks", "compact", "lines", "values"]

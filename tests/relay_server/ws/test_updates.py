@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import pytest_twisted
 from twisted.internet import reactor
+from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 from twisted.internet.threads import deferToThread
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from relay_protocol import limits
+from relay_protocol.errors import NotFound
+from relay_server.access import Principal
 from relay_server.auth.origins import Origins
 from relay_server.common import close_codes
 from relay_server.http import live_updates
 from relay_server.http.live_updates import Sources
-from relay_server.ws.updates import MESSAGE_BYTES, UpdatesAuth, UpdatesFactory
+from relay_server.ws.updates import MESSAGE_BYTES, STOPS, UpdatesAuth, UpdatesFactory
 from tests.worlds.http_client import MemoryAuth, World
 from tests.worlds.websocket_client import Client
 
@@ -30,6 +33,26 @@ TOKEN = {"Authorization": "Bearer ann"}
 ROBOTS = {"event": "robots", "data": {"robots": [{"name": "rover", "seen by": "ann"}]}}
 
 
+class Stops:
+    """Takes orders to stop; the payload ``{}`` has no robots."""
+
+    def __init__(self) -> None:
+        self.orders: list[tuple[str, bytes, str]] = []
+        self.sends: list[Callable[[bytes], None]] = []
+        self.waiting: list[Deferred[None]] = []
+
+    async def carry_out(
+        self, principal: Principal, payload: bytes, address: str, send: Callable[[bytes], None]
+    ) -> None:
+        if payload == b"{}":
+            raise NotFound("the order matches no robot")
+        self.orders.append((principal.name, payload, address))
+        self.sends.append(send)
+        wake: Deferred[None] = Deferred()
+        self.waiting.append(wake)
+        await wake
+
+
 class Tab:
     """The websocket of one page on a transport in memory, with the relay's end."""
 
@@ -37,8 +60,15 @@ class Tab:
         self.clock = Clock()
         self.service = MemoryAuth()
         sources = Sources(self.clock, {live_updates.FIRST: self.service.robots}, self.service.on_change)
+        self.stops = Stops()
         self.gate = UpdatesAuth(
-            self.clock, self.service, self.service.timing, Origins("http", [ORIGIN]), "sb", sources
+            self.clock,
+            self.service,
+            self.service.timing,
+            Origins("http", [ORIGIN]),
+            "sb",
+            sources,
+            self.stops,
         )
         self.client = Client(self.gate, PATH, clock=self.clock, factory=UpdatesFactory, **(headers or TOKEN))
 
@@ -135,15 +165,51 @@ def test_it_ends_with_the_credentials() -> None:
     assert tab.gone()
 
 
-@pytest.mark.parametrize(
-    ("size", "code"),
-    [(1, close_codes.INVALID), (MESSAGE_BYTES + 1, close_codes.TOO_BIG), (0, close_codes.INVALID)],
-)
-def test_a_message_closes_the_websocket(size: int, code: int) -> None:
-    """A message of more than a few bytes is not even read."""
+def test_a_message_is_an_order_to_stop_and_its_lines_are_events() -> None:
     tab = Tab()
-    tab.client.says("x" * size)
-    assert tab.client.closed == code
+    tab.client.says('{"robots":["*"],"do":"stop"}')
+    [(user, payload, address)] = tab.stops.orders
+    assert (user, json.loads(payload)["do"]) == ("ann", "stop")
+    assert address
+    tab.stops.sends[0](b'{"robot":"rover","ok":true}')
+    tab.client.run()
+    assert tab.events[1:] == [{"event": "order", "data": {"robot": "rover", "ok": True}}]
+
+
+def test_a_stop_continues_when_its_page_is_gone() -> None:
+    tab = Tab()
+    tab.client.says("stop")
+    tab.client.transport.loseConnection()
+    assert tab.gone()
+    [wake] = tab.stops.waiting
+    tab.stops.sends[0](b"{}")
+    wake.callback(None)
+
+
+def test_a_stop_that_can_not_begin_closes_with_its_reason() -> None:
+    tab = Tab()
+    tab.client.says("{}")
+    assert tab.client.closed == close_codes.NOT_FOUND
+    assert tab.gone()
+
+
+def test_a_page_has_few_stops_at_a_time() -> None:
+    tab = Tab()
+    for _ in range(STOPS):
+        tab.client.says("stop")
+    tab.stops.waiting.pop(0).callback(None)
+    tab.client.says("stop")
+    assert tab.client.closed is None
+    tab.client.says("stop")
+    assert tab.client.closed == close_codes.TOO_MANY_ERRORS
+    assert len(tab.stops.orders) == STOPS + 1
+
+
+def test_a_message_that_is_too_large_is_not_read() -> None:
+    tab = Tab()
+    tab.client.says("x" * (MESSAGE_BYTES + 1))
+    assert tab.client.closed == close_codes.TOO_BIG
+    assert not tab.stops.orders
     assert tab.gone()
 
 

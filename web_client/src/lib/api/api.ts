@@ -211,7 +211,7 @@ export interface FleetWatcher {
 
 /** Follows robots and alerts until it is closed. */
 export function fleetStream(watcher: FleetWatcher, page: Place): Stream {
-  return new Stream(socketAddress('/api/v1/robots/stream', page), {
+  return new Stream(fleetSocket(page), {
     received: (event, data) => {
       const update = data as Update
       if (event === 'robots' && 'robots' in update) watcher.robots(update.robots)
@@ -227,6 +227,11 @@ type Place = Pick<Location, 'protocol' | 'host'>
 
 function socketAddress(path: string, page: Place): string {
   return `${page.protocol === 'https:' ? 'wss' : 'ws'}://${page.host}${path}`
+}
+
+/** URL of the websocket of all robots of the user. */
+export function fleetSocket(page: Place): string {
+  return socketAddress('/api/v1/robots/stream', page)
 }
 
 /** URL of the rosbridge websocket of a robot. */

@@ -1,13 +1,15 @@
-/** A stop by a websocket of its own.
+/** Stops by a websocket of their own.
  *
  * Browsers allow six HTTP/1.1 connections to a host, over all tabs. Camera streams in other tabs can hold all of them; then
  * a request waits until one ends. Websockets have a limit of their own, which is far higher.
  */
 import { ending } from './closeCodes'
 import { newStopId } from '../control/control'
-import { robotSocket, STOP_TIMEOUT_MS } from './api'
+import { sentence } from '../format'
+import { fleetSocket, robotSocket, STOP_TIMEOUT_MS } from './api'
 import { ReceiveTimeout } from '../timeoutSignal'
 import { Refusal, Unreachable } from './request'
+import type { Order, OrderLine } from './types'
 
 const STOP = 'switchboard_msgs/srv/Stop'
 
@@ -44,6 +46,39 @@ export async function stopBySocket(name: string, why = '', stopId = newStopId(),
   } finally {
     patience.end()
     socket.onopen = socket.onclose = null
+    socket.close()
+  }
+}
+
+/** Gives an order to stop over a new websocket (SPEC 1.7-26).
+ *
+ * @param take each line of the answer
+ * @param signal ends the attempt
+ * @throws Refusal the relay's reason
+ * @throws Unreachable the connection failed, or no line came for longer than the relay ever takes
+ */
+export async function stopAllBySocket(order: Order, take: (line: OrderLine) => void, signal?: AbortSignal): Promise<void> {
+  const socket = new WebSocket(fleetSocket(location))
+  const patience = new ReceiveTimeout(STOP_TIMEOUT_MS, signal)
+  try {
+    await new Promise<void>((resolve, reject) => {
+      patience.signal.addEventListener('abort', () => reject(new Unreachable()))
+      socket.onopen = () => socket.send(JSON.stringify(order))
+      socket.onclose = ({ code, reason }) => {
+        const words = sentence(reason)
+        reject(code < 4000 || words === '' ? new Unreachable() : new Refusal(code === 4401 ? 401 : 403, words))
+      }
+      socket.onmessage = ({ data }) => {
+        const { event, data: line } = JSON.parse(data as string) as { event: string; data: OrderLine }
+        if (event !== 'order') return
+        patience.begin()
+        take(line)
+        if ('done' in line) resolve()
+      }
+    })
+  } finally {
+    patience.end()
+    socket.onopen = socket.onclose = socket.onmessage = null
     socket.close()
   }
 }

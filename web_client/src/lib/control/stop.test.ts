@@ -1,6 +1,6 @@
 import { afterEach, beforeEach, expect, it, vi } from 'vitest'
 import { Refusal, Unreachable } from '../api/request'
-import { stopAll, stopByAllPaths, UNANSWERED_MS } from './stop'
+import { stopAll, stopByAllPaths } from './stop'
 
 interface Sent {
   op: string
@@ -89,16 +89,49 @@ it('is unanswered only when every path is', async () => {
   expect(await stopped).toBeInstanceOf(Unreachable)
 })
 
-it('stops robots one by one when the order to all gets no answer within a second', async () => {
-  const names: string[] = []
-  const all = stopAll(['a', 'b'], () => undefined, (name) => names.push(name)).catch((error: unknown) => error)
-  await vi.advanceTimersByTimeAsync(UNANSWERED_MS - 1)
-  expect(Socket.all).toEqual([])
-  await vi.advanceTimersByTimeAsync(1)
-  expect(Socket.all.map(({ url }) => url)).toEqual(['ws://relay/robots/a', 'ws://relay/robots/b'])
-  expect(Socket.all[1]!.sent[0]!.args.stop_id).toBe(requests[0]!.body.stop_id)
-  Socket.all[1]!.answer(STOPPED)
+const LINES = [
+  { do: 'stop', robots: ['a', 'b'], unmatched: [] },
+  { robot: 'a', ok: true, message: '', values: null, pending: false, seconds: 0.1 },
+  { robot: 'b', ok: true, message: '', values: null, pending: false, seconds: 0.1 },
+  { done: true, robots: 2, ok: 2, failed: 0, seconds: 0.1 },
+]
+
+it('stops all robots by both paths at once, and the first complete answer counts', async () => {
+  const all = stopAll()
+  await vi.advanceTimersByTimeAsync(0)
+  const [socket] = Socket.all
+  expect(socket!.url).toBe('ws://relay/api/v1/robots/stream')
+  expect(socket!.sent[0]).toEqual({ robots: ['*'], do: 'stop', stop_id: requests[0]!.body.stop_id })
+  expect(requests[0]!.path).toBe('/api/v1/fleet')
+  socket!.onmessage({ data: JSON.stringify({ event: 'robots', data: { robots: [] } }) })
+  for (const line of LINES) socket!.onmessage({ data: JSON.stringify({ event: 'order', data: line }) })
+  const { progress, failure } = await all
+  expect(failure).toBe(null)
+  expect(progress).toMatchObject({ meant: ['a', 'b'], done: true })
+  expect(progress.results).toHaveLength(2)
+  expect(socket!.closed).toBe(true)
+  expect(requests[0]!.signal!.aborted).toBe(true)
+})
+
+it('tells which robots of all are stopped when the answer breaks off', async () => {
+  const all = stopAll()
+  await vi.advanceTimersByTimeAsync(0)
+  for (const line of LINES.slice(0, 2)) Socket.all[0]!.onmessage({ data: JSON.stringify({ event: 'order', data: line }) })
+  Socket.all[0]!.onclose?.({ code: 1006, reason: '' })
   await vi.runAllTimersAsync()
-  expect(await all).toBeInstanceOf(Unreachable)
-  expect(names).toEqual(['b'])
+  const { progress, failure } = await all
+  expect(failure).toBeInstanceOf(Unreachable)
+  expect(progress.results.map(({ robot }) => robot)).toEqual(['a'])
+})
+
+it.each([
+  [4401, 'your session has ended', new Refusal(401, 'Your session has ended.')],
+  [4404, 'the order matches no robot', new Refusal(403, 'The order matches no robot.')],
+  [4503, '', new Unreachable()],
+])('tells why no robot is stopped: %i', async (code, reason, end) => {
+  const all = stopAll()
+  await vi.advanceTimersByTimeAsync(0)
+  Socket.all[0]!.onclose?.({ code, reason })
+  await vi.runAllTimersAsync()
+  expect((await all).failure).toEqual(end)
 })

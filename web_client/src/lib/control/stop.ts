@@ -1,11 +1,12 @@
 /** Stops by every path at once: each may be blocked, in the browser or between it and the relay. */
 import { giveOrder, stopRobot } from '../api/api'
-import type { OrderLine } from '../api/types'
-import { Refusal } from '../api/request'
-import { stopBySocket } from '../api/stopSocket'
+import { after, NOTHING_YET, type Progress } from '../api/fleetOrders'
+import type { Order, OrderLine } from '../api/types'
+import { Refusal, Unreachable } from '../api/request'
+import { stopAllBySocket, stopBySocket } from '../api/stopSocket'
 import { firstSuccess, newStopId } from './control'
 
-/** Milliseconds without any answer after which robots are also stopped one by one. */
+/** Milliseconds without an answer after which a stop is shown as not confirmed. */
 export const UNANSWERED_MS = 1000
 
 /** Stops a robot by HTTP and by a new websocket. Returns whether the stop is pending, because the robot is offline.
@@ -28,32 +29,30 @@ export async function stopByAllPaths(
   return result
 }
 
-/** Stops all robots of the user by one order, and one by one if that gets no answer.
+/** Stops all robots of the user by HTTP and by a new websocket. Returns the first complete answer.
  *
- * @param known names of the robots that the page knows
- * @param take each line of the answer to the order
- * @param stopped a robot that was stopped by itself
- * @throws Unreachable the order got no answer, or the answer broke off
+ * If there is none, returns the longest one with the error that has a reason, else the first error.
  */
-export async function stopAll(known: string[], take: (line: OrderLine) => void, stopped: (name: string) => void): Promise<void> {
-  const stopId = newStopId()
-  const each: Promise<void>[] = []
-  const timer = setTimeout(() => {
-    for (const name of known) {
-      const confirmed = stopBySocket(name, '', stopId).then((later) => (later ? undefined : stopped(name)))
-      each.push(confirmed.catch(() => undefined))
+export async function stopAll(): Promise<{ progress: Progress; failure: unknown }> {
+  const order: Order = { robots: ['*'], do: 'stop', stop_id: newStopId() }
+  const rest = new AbortController()
+  let longest = NOTHING_YET
+  const paths = [giveOrder, stopAllBySocket].map(async (give) => {
+    let progress = NOTHING_YET
+    const take = (line: OrderLine) => {
+      progress = after(progress, line)
+      if (progress.results.length >= longest.results.length) longest = progress
     }
-  }, UNANSWERED_MS)
+    await give(order, take, rest.signal)
+    if (!progress.done) throw new Unreachable()
+    return progress
+  })
   try {
-    await giveOrder({ robots: ['*'], do: 'stop', stop_id: stopId }, (line) => {
-      clearTimeout(timer)
-      take(line)
-    })
-  } catch (error) {
-    await Promise.all(each)
-    throw error
+    return { progress: await firstSuccess(paths, isRefusal), failure: null }
+  } catch (failure) {
+    return { progress: longest, failure }
   } finally {
-    clearTimeout(timer)
+    rest.abort()
   }
 }
 
