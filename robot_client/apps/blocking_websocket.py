@@ -49,7 +49,7 @@ class BlockingWebsocket:
     def __iter__(self) -> Iterator[str | bytes]:
         """Its messages, until it is closed in order.
 
-        :raises websockets.exceptions.ConnectionClosedError: it ends otherwise
+        :raises websockets.exceptions.ConnectionClosed: it ends otherwise
         """
         with contextlib.suppress(ConnectionClosedOK):
             while True:
