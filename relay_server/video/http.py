@@ -78,12 +78,9 @@ _VIEWER = """<!DOCTYPE html>
 """
 """The page around a stream, as web_video_server has it."""
 
-_BY_WEBSOCKET = """<img alt="{title}"><p></p><script src="/stream_viewer.js"></script>
+_STREAM = """<img alt="{title}"><p></p><script src="/stream_viewer.js"></script>
 <noscript><img src="stream?{query}" alt="{title}"></noscript>"""
-"""It holds none of the browser's six HTTP/1.1 connections."""
-
-_BY_HTTP = """<img src="stream?{query}" alt="{title}">"""
-"""For PNG, which is not sent by websocket."""
+"""The script holds none of the browser's six HTTP/1.1 connections for JPEG, and for PNG only while it is seen."""
 
 
 class TicketChecker(Protocol):
@@ -276,12 +273,11 @@ class VideoResource(Resource):
         query = _query(request)
         wanted = parse_parameters(query, "stream")
         title = html.escape(f"{wanted.camera} of {robot}")
-        content = _BY_HTTP if wanted.settings.codec == "png" else _BY_WEBSOCKET
         request.setHeader(b"content-type", b"text/html; charset=utf-8")
         if request.site.cross_origin is not None:
             request.site.cross_origin.allow_frames(request)
         return _VIEWER.format(
-            title=title, content=content.format(title=title, query=html.escape(query))
+            title=title, content=_STREAM.format(title=title, query=html.escape(query))
         ).encode()
 
     @described(

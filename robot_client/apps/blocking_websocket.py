@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterator
 from types import TracebackType
 from typing import Any, TypeVar
 
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosedOK
 
 Result = TypeVar("Result")
 
@@ -43,6 +45,15 @@ class BlockingWebsocket:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def __iter__(self) -> Iterator[str | bytes]:
+        """Its messages, until it is closed in order.
+
+        :raises websockets.exceptions.ConnectionClosed: it ends otherwise
+        """
+        with contextlib.suppress(ConnectionClosedOK):
+            while True:
+                yield self.recv()
 
     def send(self, message: str | bytes) -> None:
         """Send a message.

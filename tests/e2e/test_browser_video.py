@@ -331,6 +331,21 @@ def test_the_page_of_a_stream_holds_no_http_connection_and_pauses_while_it_is_hi
         each.close()
 
 
+def test_the_page_of_png_gives_up_its_connection_while_it_is_hidden(
+    world: World, open_page: OpenPage
+) -> None:
+    """PNG comes as an image stream, which holds an HTTP connection."""
+    page = open_page()
+    page.goto(f"/robots/rover/video/stream_viewer?topic={CAMERA}&width=320&type=png")
+    world.until_streamed(CAMERA, viewers=1, width=320)
+    expect(page.locator("img")).to_have_js_property("naturalWidth", 320)
+    page.evaluate(HIDE, True)
+    wait_for("nobody watches", lambda: not any(each["viewers"] for each in world.streams()))
+    page.evaluate(HIDE, False)
+    world.until_streamed(CAMERA, viewers=1, width=320)
+    expect(page.locator("img")).to_have_js_property("naturalWidth", 320)
+
+
 def foreign(browser: Browser, world: World, url: str) -> Page:
     """A page of another site, which has no session with the relay."""
     page = browser.new_context(base_url=url).new_page()

@@ -123,8 +123,10 @@ def test_handover_between_two_roslibpy_users(scene: ControlWorld) -> None:
     assert all(seen[what] for what in ("free", "held", "requested", "handed over"))
     assert seen["asked"] == {"success": False, "message": "ann has control and was asked for it"}
     assert (seen["granted"]["success"], seen["released"]["success"]) == (True, True)
-    after = [each["v"] for each in scene.robot.events("command", seen["since"]) if each["v"]]
-    assert after
+    after = wait_for(
+        "the second moves it",
+        lambda: [each["v"] for each in scene.robot.events("command", seen["since"]) if each["v"]],
+    )
     assert all(v < 0 for v in after), "the first moved it after he had handed it over"
 
     def first_actions() -> list[str]:

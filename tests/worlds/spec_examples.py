@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import json
 import re
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from PIL import Image
 
 from relay_protocol import jsontext, link
 from relay_protocol.rights import Level
+from relay_server.channels import encodings
 from tests.worlds.relay import FIBONACCI, GRAPH, MemoryLink, Person, World
 from tests.worlds.specification import CHAPTERS
 
@@ -82,6 +84,8 @@ class Exchange:
     """
 
     def __init__(self) -> None:
+        # Other tests in this process have made fragments too.
+        encodings._numbers = itertools.count(1)
         self.world = World()
         self.world.robot_comes()
         self.world.robot.graph.actions.update(
@@ -153,7 +157,7 @@ class Exchange:
             assert got.keys() == shown.keys()
             assert png_text(got["data"]) == png_text(shown["data"])
         else:
-            assert compact(json.loads(received)) == said
+            assert compact(json.loads(received)) == said, f"the client received {received!r}"
 
 
 __all__ = ["BLOCKS", "GRAPH", "Block", "Exchange", "blocks", "compact", "lines", "values"]

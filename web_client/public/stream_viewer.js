@@ -1,7 +1,7 @@
 // Shows a camera on the page /robots/<robot>/video/stream_viewer.
 //
 // The frames come by websocket: a browser allows six HTTP/1.1 connections to a host, over all its tabs, and an image stream
-// would hold one of them. A hidden page closes its websocket.
+// would hold one of them. PNG comes as an image stream all the same. A hidden page gives up its connection.
 const image = document.querySelector('img')
 const words = document.querySelector('p')
 const query = new URLSearchParams(location.search)
@@ -52,14 +52,27 @@ async function show(frame) {
   if (before.startsWith('blob:')) URL.revokeObjectURL(before)
 }
 
-document.addEventListener('visibilitychange', () => {
-  if (!reconnects) return
-  if (!document.hidden && socket === null) connect()
-  if (!document.hidden || socket === null) return
+function disconnect() {
   const closing = socket
   socket = null
   clearTimeout(timer)
-  closing.close()
+  closing?.close()
+}
+
+function showStream() {
+  image.src = `stream${location.search}`
+}
+
+function hideStream() {
+  image.removeAttribute('src')
+}
+
+const [begin, end] = query.get('type') === 'png' ? [showStream, hideStream] : [connect, disconnect]
+
+document.addEventListener('visibilitychange', () => {
+  if (!reconnects) return
+  if (document.hidden) end()
+  else if (socket === null) begin()
 })
 
-connect()
+begin()

@@ -89,11 +89,13 @@ def fake(world: World) -> FakeResources:
     return made
 
 
-def follows(world: World) -> Transport:
+def follows(world: World, method: str = "GET") -> Transport:
     """A client follows the goal."""
     transport = world.connect()
     lines = {"Host": HOST, "Accept": "text/event-stream", **ANN}
-    head = f"GET {HERE}/g HTTP/1.1\r\n" + "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    head = f"{method} {HERE}/g HTTP/1.1\r\n" + "".join(
+        f"{name}: {value}\r\n" for name, value in lines.items()
+    )
     world.send(transport, head.encode() + b"\r\n")
     return transport
 
@@ -145,6 +147,17 @@ def test_gone_viewer_is_removed(world: World, fake: FakeResources) -> None:
     follows(world).loseConnection()
     world.clock.pump([1.0] * 20)
     assert fake.cancelled
+
+
+def test_head_of_a_stream_ends_and_follows_nothing(world: World, fake: FakeResources) -> None:
+    reader = follows(world, "HEAD")
+    head, _, rest = reader.value().partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 200 ")
+    assert b"text/event-stream" in head
+    fake.goal.feedback(feedback(1))
+    world.clock.pump([1.0] * 3)
+    assert rest == reader.value().partition(b"\r\n\r\n")[2] == b""
+    assert fake.goal._polls == 0
 
 
 def test_a_stream_ends_with_its_token(world: World, fake: FakeResources) -> None:

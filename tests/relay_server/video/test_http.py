@@ -254,15 +254,6 @@ async def test_the_page_around_a_stream_asks_for_it_with_the_same_words(show: Sh
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_page_around_png_has_an_image_and_no_script(show: Show) -> None:
-    """PNG is not sent by websocket."""
-    path = STREAM.replace("/stream", "/stream_viewer") + "&type=png"
-    _, _, body = await show.request(path, Authorization="").answer()
-    assert f'<body><img src="stream?topic={CAMERA}&amp;type=png"'.encode() in body
-    assert b"<script" not in body
-
-
-@pytest_twisted.ensureDeferred
 async def test_a_camera_that_is_only_compressed_may_be_named_by_its_raw_topic(show: Show) -> None:
     """As users of image_transport do."""
     control = show.robot_comes()
