@@ -93,7 +93,9 @@ def follows(world: World, method: str = "GET") -> Transport:
     """A client follows the goal."""
     transport = world.connect()
     lines = {"Host": HOST, "Accept": "text/event-stream", **ANN}
-    head = f"{method} {HERE}/g HTTP/1.1\r\n" + "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    head = f"{method} {HERE}/g HTTP/1.1\r\n" + "".join(
+        f"{name}: {value}\r\n" for name, value in lines.items()
+    )
     world.send(transport, head.encode() + b"\r\n")
     return transport
 
