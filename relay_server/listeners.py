@@ -155,11 +155,11 @@ def adopt(reactor: Any, opened: int, factory: Any, tls: ServerTls | None) -> Any
 
     :param opened: descriptor of the listening socket, which is closed
     """
-    with socket.socket(fileno=opened) as listening:
-        listening.setblocking(False)
+    with socket.socket(fileno=opened) as listener:
+        listener.setblocking(False)
         context: Any = tls
         served = factory if tls is None else TLSMemoryBIOFactory(context, False, factory)
-        return reactor.adoptStreamPort(listening.fileno(), listening.family, served)
+        return reactor.adoptStreamPort(listener.fileno(), listener.family, served)
 
 
 async def listen(reactor: Any, where: ListenAddress, factory: Any, tls: ServerTls | None) -> Any:

@@ -10,6 +10,7 @@ import itertools
 import re
 import statistics
 import sys
+import tokenize
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ LIMITS = {
     "files in import circles": 0,
     "class names that occur twice": 0,
     "private names": 0,
+    "names that are no terms": 0,
+    "unclear words in docstrings and comments": 0,
     "calls with an unpacked tuple": 0,
     "lines of relay_server/relay.py": 200,
     "lines of a function, 90th percentile": 30,
@@ -55,6 +58,17 @@ PRIVATE = frozenset({
 })
 # fmt: on
 """Words that name nothing in ROS, HTTP, OAuth or publish/subscribe; no class name ends in one of them."""
+
+# fmt: off
+NO_TERMS = frozenset({
+    "told", "asker", "desk", "desks", "moments", "listening", "journal", "hall", "guests", "keeper", "helm", "pursuing",
+    "providing", "giving", "meanings", "rooms", "offices", "below", "beside",
+})
+# fmt: on
+"""Names of variables, attributes, parameters and functions that do not say what they hold."""
+
+UNCLEAR = re.compile(r"\b(?:told|tells?|telling|hears?|heard|somebody|nobody|anew)\b", re.IGNORECASE)
+"""Words of docstrings and comments that a plainer one replaces: notify, receive, distinguish, again."""
 
 GENERATED = "<!-- Written by scripts/"
 """Pages that begin with this under their heading are written by programs, and not counted."""
@@ -179,6 +193,55 @@ def private_names(all_modules: list[Module]) -> list[str]:
     return found
 
 
+def _names_of(node: ast.AST) -> list[str]:
+    """Names that a node of a syntax tree gives or uses."""
+    if isinstance(node, ast.Name):
+        return [node.id]
+    if isinstance(node, ast.Attribute):
+        return [node.attr]
+    if isinstance(node, ast.arg | ast.keyword):
+        return [node.arg or ""]
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        return [node.name]
+    return []
+
+
+def names_without_meaning(all_modules: list[Module]) -> list[str]:
+    """Variables, attributes, parameters and functions that are called one of :data:`NO_TERMS`."""
+    return [
+        f"{module.path.relative_to(ROOT)}:{node.lineno} {name}"
+        for module in all_modules
+        for node in ast.walk(module.tree)
+        for name in _names_of(node)
+        if name.strip("_") in NO_TERMS
+    ]
+
+
+def _texts(module: Module) -> Iterator[tuple[int, str]]:
+    """Docstrings, of variables too, and comments of a module, with their lines."""
+    for node in ast.walk(module.tree):
+        if (
+            isinstance(node, ast.Expr)
+            and isinstance(node.value, ast.Constant)
+            and isinstance(node.value.value, str)
+        ):
+            yield node.lineno, node.value.value
+    with tokenize.open(module.path) as stream:
+        for token in tokenize.generate_tokens(stream.readline):
+            if token.type == tokenize.COMMENT:
+                yield token.start[0], token.string
+
+
+def unclear_words(all_modules: list[Module]) -> list[str]:
+    """Words of :data:`UNCLEAR` in docstrings and comments."""
+    return [
+        f"{module.path.relative_to(ROOT)}:{line} {word}"
+        for module in all_modules
+        for line, text in _texts(module)
+        for word in UNCLEAR.findall(text)
+    ]
+
+
 def _is_unpacked(argument: ast.expr) -> bool:
     """Whether an argument is an unpacked tuple. ``*args`` hands on what a function was given itself."""
     return isinstance(argument, ast.Starred) and getattr(argument.value, "id", "") != "args"
@@ -270,6 +333,8 @@ def main(arguments: list[str]) -> int:
         "files in import circles": circle_lines,
         "class names that occur twice": repeated_names(all_modules),
         "private names": private_names(all_modules),
+        "names that are no terms": names_without_meaning(all_modules),
+        "unclear words in docstrings and comments": unclear_words(all_modules),
         "calls with an unpacked tuple": unpacked_calls(all_modules),
         "functions over 60 lines": [text for lines, text in lengths if lines > 60],
     }

@@ -167,8 +167,8 @@ class _LostConnection(NamedTuple):
 class ReconnectGuard:
     """Users whose connection ended while they commanded, for the relay.
 
-    Libraries reconnect by themselves, go on commanding, and send what waited in their queues meanwhile. Nothing tells
-    that from a program that was started again, so it is judged by time and by how the connection ended.
+    Libraries reconnect by themselves, go on commanding, and send what waited in their queues meanwhile. Nothing
+    distinguishes that from a program that was started again, so it is judged by time and by how the connection ended.
 
     :param capacity: most users that are remembered; the least recent are forgotten first
     """

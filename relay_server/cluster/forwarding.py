@@ -80,7 +80,7 @@ class ForwardedClient(msgspec.Struct, frozen=True):
     """The client of a forwarded request. The fields between ``early`` and ``final`` are those of :class:`Principal`.
 
     :param address: its network address
-    :param early: whether it may have sent messages before the home knew it; they are older than the home can tell
+    :param early: whether it may have sent messages before the home knew it; they are older than the home knows
     :param scope: as text; ``None`` for all rights of the user
     :param final: whether the relay answers by what it has itself, and asks no other relay
     """

@@ -111,7 +111,7 @@ def open_socket(where: ListenAddress) -> socket.socket:
 
     :raises Invalid: the address is taken, or not of this machine
     """
-    return _listening(where, shared=False)
+    return _bound_socket(where, shared=False)
 
 
 def open_sockets(where: ListenAddress, count: int) -> list[socket.socket]:
@@ -120,9 +120,9 @@ def open_sockets(where: ListenAddress, count: int) -> list[socket.socket]:
     :raises Invalid: the address is taken, or not of this machine; or this is not Linux
     """
     # Two relays could share a port without noticing; this finds the other one.
-    with _listening(where, shared=False) as probe:
+    with _bound_socket(where, shared=False) as probe:
         where = ListenAddress(where.host, probe.getsockname()[1])
-    sockets = [_listening(where, shared=True) for _ in range(count)]
+    sockets = [_bound_socket(where, shared=True) for _ in range(count)]
     program = _by_network(count)
     code = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in program))
     try:
@@ -135,7 +135,7 @@ def open_sockets(where: ListenAddress, count: int) -> list[socket.socket]:
     return sockets
 
 
-def _listening(where: ListenAddress, *, shared: bool) -> socket.socket:
+def _bound_socket(where: ListenAddress, *, shared: bool) -> socket.socket:
     opened = socket.socket(socket.AF_INET6 if ":" in where.host else socket.AF_INET)
     try:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -153,8 +153,8 @@ def _listening(where: ListenAddress, *, shared: bool) -> socket.socket:
 def _by_network(count: int) -> list[tuple[int, int, int, int]]:
     """Instructions of classic BPF (bpf(2)) that return the number of a socket by the source of a packet.
 
-    They hash what :func:`relay_server.auth.login_limiter.network_of` tells apart: an IPv4 address, an IPv6 /64. Each is
-    an operation, two jumps and an operand.
+    They hash what :func:`relay_server.auth.login_limiter.network_of` distinguishes: an IPv4 address, an IPv6 /64.
+    Each is an operation, two jumps and an operand.
     """
     at = (1 << 32) - _NETWORK_HEADER
     return [

@@ -1,7 +1,7 @@
 """Stops in the database: each is stored until its robot has confirmed it, in case the robot or the relay dies before.
 
-Stops are told apart by their time, which is compared for equality only, as clocks may be set back. Whether two requests
-are the same stop is another question, see :class:`relay_server.control.stopping.StopIds`.
+Stops are distinguished by their time, which is compared for equality only, as clocks may be set back. Whether two
+requests are the same stop is another question, see :class:`relay_server.control.stopping.StopIds`.
 """
 
 from __future__ import annotations

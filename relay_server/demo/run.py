@@ -163,7 +163,7 @@ class _Demo:
 
 @contextmanager
 def _interrupted_afterwards() -> Iterator[None]:
-    """Have SIGTERM and Ctrl-C wait for the end of a step, so that no process is started that nobody ends."""
+    """Have SIGTERM and Ctrl-C wait for the end of a step, so that every process that is started is ended."""
     received: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     for number, handler in before.items():

@@ -52,7 +52,7 @@ def member_endpoint(part: str, summary: str, **more: Any) -> Callable[[Any], End
 
 
 async def read_only(work: Awaitable[T]) -> T:
-    """The result of work that changes nothing: after a failure nobody needs to ask whether it was done."""
+    """The result of work that changes nothing: a failure leaves no doubt whether it was done."""
     try:
         return await work
     except MaybeDone as error:

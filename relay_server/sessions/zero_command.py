@@ -17,7 +17,7 @@ STILL_BYTES = 64 * KIB
 _TRAJECTORIES = frozenset(
     {"trajectory_msgs/msg/JointTrajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory"}
 )
-_BESIDE = {"control_msgs/msg/JointJog": ("header", "joint_names", "duration")}
+_NOT_MOTION = {"control_msgs/msg/JointJog": ("header", "joint_names", "duration")}
 """Fields that move nothing, by type."""
 
 
@@ -37,8 +37,8 @@ def is_zero_command(type_name: str, body: bytes) -> bool:
         return False
     if type_name in _TRAJECTORIES:  # A goal of all zeros is a goal as well.
         return not message.get("points")
-    beside = _BESIDE.get(type_name, ("header",))
-    return all(_is_all_zero(value) for field, value in message.items() if field not in beside)
+    not_motion = _NOT_MOTION.get(type_name, ("header",))
+    return all(_is_all_zero(value) for field, value in message.items() if field not in not_motion)
 
 
 def _is_all_zero(value: Any) -> bool:

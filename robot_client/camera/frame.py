@@ -22,7 +22,7 @@ SILENT_PERIODS = 2.5
 """Frame periods without a frame after which a camera counts as silent, and its latest frame as outdated."""
 
 FIRST_FRAME_SECONDS = 10.0
-"""Seconds for which the only frame so far counts as current. The relay can't tell its age when a stream
+"""Seconds for which the only frame so far counts as current. The relay does not know its age when a stream
 begins with it, and adds its own time for such a frame."""
 
 SLOW_PERIOD = 2.0

@@ -19,7 +19,7 @@ _ROTATIONS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _FONT_SCALES = (0.45, 1.2)
-"""Least and greatest scale of the font: below the first, JPEG makes a 3 look like an 8."""
+"""Least and greatest scale of the font: descent the first, JPEG makes a 3 look like an 8."""
 _FONT_HEIGHT = 900
 """Height of an image, pixels, at which the font has scale 1."""
 
@@ -133,13 +133,13 @@ def _burn_in(pixels: Pixels, stamp: float) -> None:
     room = pixels.shape[1] - 4
     size = min(max(pixels.shape[0] / _FONT_HEIGHT, _FONT_SCALES[0]), _FONT_SCALES[1])
     for text in (f"{clock:%Y-%m-%d} {parts} UTC", f"{parts} UTC", parts, time):
-        (width, height), below = cv2.getTextSize(text, _FONT, size, _thickness(size))
+        (width, height), descent = cv2.getTextSize(text, _FONT, size, _thickness(size))
         if width <= room:
             break
     else:
         size *= room / width
-        (width, height), below = cv2.getTextSize(text, _FONT, size, 1)
-    cv2.rectangle(pixels, (0, 0), (width + 4, height + below + 2), (0, 0, 0), cv2.FILLED)
+        (width, height), descent = cv2.getTextSize(text, _FONT, size, 1)
+    cv2.rectangle(pixels, (0, 0), (width + 4, height + descent + 2), (0, 0, 0), cv2.FILLED)
     cv2.putText(pixels, text, (2, height + 2), _FONT, size, (255, 255, 255), _thickness(size), cv2.LINE_AA)
 
 

@@ -338,8 +338,8 @@ class CommandServer(Module):
     def start(self) -> None:
         """Listen."""
         factory = _CommandFactory(self._connected)
-        listening = reactor.listenTCP(self._address[1], factory, interface=self._address[0])
-        address = listening.getHost()
+        port = reactor.listenTCP(self._address[1], factory, interface=self._address[0])
+        address = port.getHost()
         print(f"listening at {address.host}:{address.port}", flush=True)
 
     def _connected(self) -> CommandConnection:

@@ -58,10 +58,10 @@ def find_files(folder: str, patterns: list[str]) -> Iterator[FoundFile]:
     yield from _find(folder, "", patterns, 0)
 
 
-def _find(folder: str, below: str, patterns: list[str], depth: int) -> Iterator[FoundFile]:
-    with os.scandir(f"{folder}/{below}") as entries:
+def _find(folder: str, prefix: str, patterns: list[str], depth: int) -> Iterator[FoundFile]:
+    with os.scandir(f"{folder}/{prefix}") as entries:
         for entry in entries:
-            path = f"{below}{entry.name}"
+            path = f"{prefix}{entry.name}"
             try:
                 if entry.is_dir(follow_symlinks=False):
                     if depth < MAX_DEPTH:
@@ -159,9 +159,9 @@ def _parent(folder: str, path: str) -> Iterator[tuple[int, str]]:
     current = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         for each in folders:
-            below = os.open(each, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=current)
+            inner = os.open(each, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=current)
             os.close(current)
-            current = below
+            current = inner
         yield current, name
     finally:
         os.close(current)

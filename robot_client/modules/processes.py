@@ -129,9 +129,9 @@ def descendants(pid: int) -> list[int]:
     found: list[int] = []
     waiting = [pid]
     while waiting:
-        below = children.get(waiting.pop(), [])
-        found += below
-        waiting += below
+        of_parent = children.get(waiting.pop(), [])
+        found += of_parent
+        waiting += of_parent
     return found
 
 

@@ -9,7 +9,7 @@ Orders of the relay enter at ``order_handler``. A stop does all of this at once,
 1. ``authority`` refuses further commands and goals,
 2. ``topic_stopper`` publishes zero where clients commanded,
 3. the channels cancel the goals of clients,
-4. modules are told (``robot_client.modules``),
+4. modules are notified (``robot_client.modules``),
 5. ``hardware`` sets the switches,
 6. ``goal_canceller`` cancels goals of other nodes, ``graph_zero_publisher`` publishes zero where other nodes command,
 7. ``stop_store`` writes it to disk, so that it outlives the daemon.

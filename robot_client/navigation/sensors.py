@@ -106,11 +106,11 @@ def _seen_through(
     begin = np.where(near, np.minimum(leave, shortest)[:, None], 0.0).max(axis=0)
     begin[near.sum(axis=0) < AGREEING] = 0.0
     rows = np.where(np.isnan(depth), len(depth), np.arange(len(depth))[:, None])
-    below = np.minimum.accumulate(rows[::-1], axis=0)[::-1]
+    measured_row = np.minimum.accumulate(rows[::-1], axis=0)[::-1]
     """The row of the next measured pixel at or below each; beyond the last without one."""
     padded = np.vstack((depth, np.full((1, depth.shape[1]), np.nan, dtype=depth.dtype)))
-    behind = np.maximum(np.take_along_axis(padded, below, axis=0), enter[:, None])
+    behind = np.maximum(np.take_along_axis(padded, measured_row, axis=0), enter[:, None])
     hidden = unseen & (behind < leave[:, None])
     end = np.where(hidden, behind, np.inf).min(axis=0)
-    bottom = np.where(unseen & (below == len(depth)), leave[:, None], 0.0).max(axis=0)
+    bottom = np.where(unseen & (measured_row == len(depth)), leave[:, None], 0.0).max(axis=0)
     return np.maximum(begin, bottom), end

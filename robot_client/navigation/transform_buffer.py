@@ -66,8 +66,8 @@ class TransformBuffer:
         :raises Unavailable: the frames are not connected, or only by static transforms: no robot moves by those
         """
         matrix = self.lookup(map_frame, base_frame)
-        *below, localiser = self._tree.arrivals(map_frame, base_frame) or [math.inf]
-        odometry = min(below, default=math.inf)
+        *inner, localiser = self._tree.arrivals(map_frame, base_frame) or [math.inf]
+        odometry = min(inner, default=math.inf)
         if math.isinf(odometry):
             odometry = localiser
         if math.isinf(odometry):

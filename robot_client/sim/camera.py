@@ -196,9 +196,9 @@ def _caption(frame: Image, text: str, x: int) -> None:
     scale = min(width / WIDTH, height / HEIGHT)
     font, stroke = scale * _FONT_SCALE, max(1, int(scale))
     left = round(x * scale) % width
-    (long, high), below = cv2.getTextSize(text, _FONT, font, stroke)
+    (long, high), descent = cv2.getTextSize(text, _FONT, font, stroke)
     edge, gap = round(8 * scale), round(6 * scale)
-    plate = frame[height - high - below - 2 * edge : height - edge, left - gap : left + long + gap]
+    plate = frame[height - high - descent - 2 * edge : height - edge, left - gap : left + long + gap]
     cv2.convertScaleAbs(plate, dst=plate, alpha=0.35)
-    bottom = height - round(11 * scale) - below
+    bottom = height - round(11 * scale) - descent
     cv2.putText(frame, text, (left, bottom), _FONT, font, (245, 245, 245), stroke, cv2.LINE_AA)
