@@ -47,7 +47,7 @@ LISTED = 1024
 """Users, with the scopes of their tokens, whose robots are remembered."""
 
 LOOKUP_SECONDS = 3.0
-"""Seconds that the database may take to confirm that a client may stop a robot."""
+"""Seconds that the database may take to confirm a client's rights: at a login by websocket, and before a stop."""
 
 NOT_LOOKED_UP = (
     f"the database has not answered within {LOOKUP_SECONDS:g} s, and without it the relay can't check your rights. "

@@ -66,8 +66,8 @@ class SampleFrame(_Frame, frozen=True, order=True, gc=False):
     """Kind 1: one message of a topic.
 
     :param number: subscription (robot to relay) or publication (relay to robot) it belongs to
-    :param stamp: nanoseconds; robot to relay: the robot's wall clock when the sample reached it; relay to
-        robot: the relay's monotonic clock at the latest moment before which the command can't have been sent
+    :param stamp: nanoseconds; robot to relay: the robot's wall clock when the sample reached it; relay to robot: as of
+        :class:`CommandFrame`
     :param body: the message in the encoding agreed, CDR with its four-byte header from ROS 2
     """
 
@@ -80,7 +80,8 @@ class CommandFrame(_Frame, frozen=True, order=True, gc=False):
     """Kind 5: one message to a topic that moves the robot.
 
     :param number: publication it belongs to
-    :param stamp: nanoseconds of the relay's monotonic clock; the command can't have been sent before
+    :param stamp: nanoseconds of the relay's monotonic clock; the command can't have been sent before. The relay calls
+        it ``earliest_sent``; the robot converts it to its own clock, and calls it ``earliest_sent`` as well
     :param source: the connection it came from, as the relay numbers them
     :param body: the message in the encoding agreed
     """

@@ -47,7 +47,7 @@ class Operation(str, enum.Enum):
     SUPPRESS = "suppress"
     """Suppress: command a topic in place of the holder of control, for milliseconds."""
     INHIBIT = "inhibit"
-    """Inhibit a topic: nothing is published on it for a time."""
+    """Inhibit a topic: the robot sends nothing of it to the relay for a time."""
     RUN = "run"
     """Have a function run on the relay's workers, for this robot."""
     MANAGE = "manage"

@@ -76,10 +76,10 @@ class ChangeNotifier:
 
 
 class IdleTimeout:
-    """Ends control when its holder sends no command for a time.
+    """Ends control when its holder sends no moving command for a time.
 
-    :param seconds: longest time without a command
-    :param latest: returns the clock's time of the latest command
+    :param seconds: longest time without a moving command
+    :param latest: returns the clock's time of the latest moving command
     :param expired: called when control is to end
     """
 
@@ -88,7 +88,7 @@ class IdleTimeout:
     ) -> None:
         self._clock = clock
         self._seconds = seconds
-        self._last_command_at = latest
+        self._last_motion_at = latest
         self._expired = expired
         self._since = 0.0
         self._timer: Timer | None = None
@@ -106,7 +106,7 @@ class IdleTimeout:
 
     def _check(self) -> None:
         self._timer = None
-        left = max(self._since, self._last_command_at()) + self._seconds - self._clock.seconds()
+        left = max(self._since, self._last_motion_at()) + self._seconds - self._clock.seconds()
         # Rounding of the clock must not cause a thousand checks.
         if left > 0.001:
             self._timer = self._clock.callLater(left, self._check)
@@ -163,7 +163,7 @@ class RobotController:
         """The clock's time from which an owner takes over by asking again."""
         self._request_timer: Timer | None = None
         """Ends an unanswered request."""
-        self._must_release: CommandStreams[LeaseClient] = CommandStreams()
+        self._unreleased: CommandStreams[LeaseClient] = CommandStreams()
         """Clients that can't acquire control by a command before they release the controls."""
         self._awaiting_robot: list[Deferred[SwitchboardError | None]] = []
         self._take_limits = Buckets(TAKES_A_SECOND, TAKES_AT_ONCE, USERS, clock.seconds)
@@ -245,7 +245,7 @@ class RobotController:
 
     def _note_lost(self, holder: Holder, why: str) -> None:
         """Record that a client has lost control without releasing it."""
-        self._must_release.refused(holder.client, self._now_ns())
+        self._unreleased.refused(holder.client, self._now_ns())
         self._record_event("control.lost", holder.client, why, moving=self._driven_by(holder.client))
 
     def _driven_by(self, client: LeaseClient) -> bool:
@@ -304,7 +304,7 @@ class RobotController:
 
     def _idle_expired(self) -> None:
         if self.lease.holder is not None:
-            self._end_control(self.lease.holder.client, f"no command for {self.rules.idle:g} s")
+            self._end_control(self.lease.holder.client, f"no moving command for {self.rules.idle:g} s")
 
     def _give_control(
         self, client: LeaseClient, why: str, how: str, implicit: bool = False
@@ -425,7 +425,7 @@ class RobotController:
 
     def may_command(self, client: LeaseClient, topic: str) -> bool:
         """Whether commands of this client to this topic are sent to the robot now."""
-        return self.lease.held_by(client) or client.number in self.snapshot.suppressed.get(topic, ())
+        return self.lease.held_by(client) or client.number in self.snapshot.suppressing.get(topic, ())
 
     def acquire_by_command(self, client: LeaseClient) -> bool:
         """Acquire control for a client that commands a free robot.
@@ -486,7 +486,7 @@ class RobotController:
 
         :raises Refused: it has not
         """
-        now, since = self._now_ns(), self._must_release.pop(client)
+        now, since = self._now_ns(), self._unreleased.pop(client)
         if since is None:
             # A new connection of a user counts as the continuation of one that has ended.
             opened = _ns(client.opened)
@@ -498,7 +498,7 @@ class RobotController:
             since = self._reconnects.silent_since(client.user, opened)
         if since is None or is_released(since, now):
             return
-        self._must_release.refused(client, now)
+        self._unreleased.refused(client, now)
         raise Refused(
             f"you had no control of robot {self.robot.name} when you began to command: release the controls for "
             f"{RELEASE_NS / 1e9:g} s"
@@ -518,13 +518,13 @@ class RobotController:
         While no client has control, it need not release (SPEC 2.5-45).
         """
         lease = self.lease
-        return client in self._must_release or any(
+        return client in self._unreleased or any(
             each is not None and each.client is not client for each in (lease.holder, lease.pending_holder)
         )
 
     def published_while_offline(self, client: LeaseClient) -> None:
         """Note that a client has published to an offline robot: it must release before the robot returns."""
-        self._must_release.refused(client, self._now_ns())
+        self._unreleased.refused(client, self._now_ns())
 
     def _replace_holder(
         self, client: LeaseClient, why: str, how: str, lost: str, *, implicit: bool = False
@@ -587,7 +587,7 @@ class RobotController:
         if lease.holder is not None and not self._may_take_over(client):
             return self._request(client, why)
         # Its session refuses commands that continue without a release.
-        self._must_release.zero(client)
+        self._unreleased.zero(client)
         self._reconnects.forget(client.user)
         how = "taken" if lease.holder is None else "taken over"
         error = await self._replace_holder(client, why, how, f"{client.name} has taken over")
@@ -660,7 +660,7 @@ class RobotController:
             return ControlReply(False, "you have no control of this robot")
         self._record_event("control.released", client, why, by, **details)
         if by is not None:
-            self._must_release.refused(client, self._now_ns())
+            self._unreleased.refused(client, self._now_ns())
         self._free_control(f"released by {client.name if by is None else by.name}")
         return ControlReply(True, "control is released")
 
@@ -723,10 +723,10 @@ class RobotController:
         """
         self.changes.forget(client)
         # The time of the command, not of the end: a client that had stopped commanding has released.
-        commanded = max(self._must_release.last(client) or 0, _ns(client.last_command_at()))
+        commanded = max(self._unreleased.last(client) or 0, _ns(client.last_command_at()))
         released = orderly or _released(client, commanded)
         self._end_control(client, "the connection has ended")
-        if self._must_release.pop(client) is not None:
+        if self._unreleased.pop(client) is not None:
             self._reconnects.connection_ended(client.user, commanded, self._now_ns(), released=released)
         self.suppression.end_of(client, lambda topic: False)
 

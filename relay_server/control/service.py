@@ -2,7 +2,7 @@
 
 Websocket clients come from :mod:`relay_server.relay_node.control`, HTTP and the admin socket from
 :mod:`relay_server.control.gateway`, orders to many robots from :mod:`relay_server.fleet`. Motion commands that
-acquire control are checked one by one in :meth:`relay_server.control.controller.RobotController.claim`.
+acquire control are checked one by one in :meth:`relay_server.control.controller.RobotController.acquire_by_command`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,8 @@ IMPLICIT = "its first command"
 """The recorded reason where a command acquired control."""
 
 DESERTED_SECONDS = 2.0
-"""Seconds without a command of the holder, after which another connection of its user acquires control by a command."""
+"""Seconds without a moving command of the holder, after which a command of another connection of its user acquires
+control."""
 
 TAKES_A_SECOND = 5.0
 TAKES_AT_ONCE = 20
@@ -66,10 +67,15 @@ class ControlSnapshot(NamedTuple):
     """Everything that decides whether a command passes.
 
     It is replaced as a whole when it changes, so that holders of the same object need not check again.
+
+    :param lease: which client has control of the robot
+    :param suppressing: by topic, the numbers of the clients that suppress the commands of all others; theirs pass
+        without control
+    :param stopped: the stop that holds; ``None``: the robot may move
     """
 
     lease: Lease
-    suppressed: Mapping[str, frozenset[int]]
+    suppressing: Mapping[str, frozenset[int]]
     stopped: StopState | None
 
 

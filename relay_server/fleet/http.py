@@ -96,7 +96,7 @@ class FleetEndpoints:
             refuse_key(request)
             earliest_sent = self._tokens.read(request.http.getHeader(HEADER))
         principal, address = request.principal, request.address
-        forwarded = request.http.forwarded is not None
+        forwarded = request.http.forwarded_client is not None
         plan = await self._service.plan(principal, order, address, earliest_sent, forwarded=forwarded)
 
         async def run(http: Request) -> None:

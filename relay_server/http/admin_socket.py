@@ -314,4 +314,4 @@ class AdminSocket:
 
 def _from_relay(request: Request) -> bool:
     """Whether another relay has forwarded a request of its own local socket."""
-    return getattr(request, "forwarded", None) is not None
+    return getattr(request, "forwarded_client", None) is not None

@@ -49,9 +49,9 @@ class RequestAuthenticator:
         :raises Refused: a cookie on a request that changes something, without a listed Origin
         :raises TooManyRequests: the user, or the network of an unknown sender, has sent too many
         """
-        if request.forwarded is not None:
+        if request.forwarded_client is not None:
             request.known = True
-            client: ForwardedClient = request.forwarded
+            client: ForwardedClient = request.forwarded_client
             return client.principal
         try:
             found = await self._proved(request, from_memory)
@@ -93,7 +93,7 @@ class RequestAuthenticator:
     def check_origin(self, request: Request) -> None:
         """:raises Refused: the request has an Origin, and it is neither listed nor the relay's own"""
         origin = request.getHeader("origin")
-        if origin is not None and request.forwarded is None:
+        if origin is not None and request.forwarded_client is None:
             self.origins.check(origin, request.getHeader("host") or "")
 
     def base(self, request: Request) -> str:

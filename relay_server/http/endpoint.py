@@ -67,7 +67,7 @@ class ApiRequest:
     """One request; authenticated and counted once :meth:`authenticate` has returned.
 
     :ivar form: media type of the answer, one of those that the endpoint offers
-    :ivar forwarded: whether another relay answers it
+    :ivar answered_elsewhere: whether another relay of the cluster answers it
     :ivar earliest_sent: earliest time at which it can have been sent, monotonic nanoseconds; ``None`` without a
         freshness token
     """
@@ -75,7 +75,7 @@ class ApiRequest:
     def __init__(self, http: Request, authenticator: RequestAuthenticator) -> None:
         self.http = http
         self.form: MediaType = JSON
-        self.forwarded = False
+        self.answered_elsewhere = False
         self.earliest_sent: int | None = None
         self._authenticator = authenticator
         self._content: bytes | None = None
@@ -88,7 +88,7 @@ class ApiRequest:
 
         None if another relay sent this request, to collect the answers itself.
         """
-        first: ForwardedClient | None = self.http.forwarded
+        first: ForwardedClient | None = self.http.forwarded_client
         if self.forwarding is None or (first is not None and first.final):
             return []
         path = self.http.uri.decode("latin-1")

@@ -16,11 +16,16 @@ class MediaType(NamedTuple):
     """One form of a resource.
 
     :param media: its media type
-    :param mark: end of its entity tags, so that the tags of two forms differ; empty for JSON
+    :param mark: of a form in RDF, the end of its entity tags, so that the tags of two forms differ
     """
 
     media: str
     mark: str = ""
+
+    @property
+    def is_rdf(self) -> bool:
+        """Whether it is one of the forms of RDF."""
+        return bool(self.mark)
 
     def tag(self, base: str) -> str:
         """The entity tag of a state in this form.
@@ -31,7 +36,7 @@ class MediaType(NamedTuple):
 
     def bases(self, tags: frozenset[str]) -> frozenset[str]:
         """The tags of JSON for tags of this form. Tags of other forms are left out."""
-        others = [each.mark for each in FORMS if each.mark and each is not self]
+        others = [each.mark for each in FORMS if each.is_rdf and each is not self]
         found = (each[:-1] for each in tags if each.endswith(f'{self.mark}"'))
         return frozenset(
             each.removesuffix(self.mark) + '"' for each in found if not each.endswith(tuple(others))

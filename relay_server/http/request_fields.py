@@ -6,14 +6,12 @@ import re
 
 from twisted.web.http_headers import Headers
 from twisted.web.server import Request
-from werkzeug.http import parse_dict_header, parse_etags
+from werkzeug.http import parse_dict_header
 
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import NAME_BYTES
-from relay_server.common.etags import as_given
 from relay_server.http.limits import extend_time_limit
-from relay_server.http.media_types import EVENTS, JSON, preferred
-from relay_server.http.openapi.operation import header
+from relay_server.http.media_types import tags_of
 
 TARGET_BYTES = 8192
 """Longest path and query together."""
@@ -155,12 +153,10 @@ WAIT = 60.0
 """Longest time that a request may wait, seconds."""
 
 APPLIED = "preference-applied"
+"""The header that names the preferences that were applied (RFC 7240 section 3)."""
 
 WARNING = "switchboard-warning"
 """Header of an answer: what went wrong with earlier requests."""
-"""The header that names the preferences that were applied (RFC 7240 section 3)."""
-
-KNOWN = header("If-None-Match", "entity tags of states that the client has")
 
 
 def query_of(request: Request) -> dict[str, str]:
@@ -179,19 +175,6 @@ def query_of(request: Request) -> dict[str, str]:
     return found
 
 
-def number_in(query: dict[str, str], name: str, least: float, most: float) -> float | None:
-    """A numeric parameter, ``None`` if it is missing.
-
-    :raises Invalid: it is not a number, or out of bounds
-    """
-    if name not in query:
-        return None
-    number = _number(query[name])
-    if not least <= number <= most:
-        raise Invalid(f"'{name}' must be a number from {least:g} to {most:g}")
-    return number
-
-
 def field(request: Request, name: str) -> str | None:
     """A list-valued header with all its lines joined (RFC 9110 section 5.3)."""
     lines = request.requestHeaders.getRawHeaders(name)
@@ -200,8 +183,7 @@ def field(request: Request, name: str) -> str | None:
 
 def if_none_match(request: Request) -> frozenset[str]:
     """The entity tags of states that the client has (``If-None-Match``)."""
-    tags = parse_etags(field(request, "if-none-match"))
-    return frozenset(f'"{each}"' for each in as_given(tags.as_set(include_weak=True)))
+    return tags_of(field(request, "if-none-match"))
 
 
 def wait_preferred(request: Request, least: float = 0.0) -> float | None:
@@ -224,11 +206,6 @@ def wait_preferred(request: Request, least: float = 0.0) -> float | None:
     extend_time_limit(request, seconds)
     request.setHeader(APPLIED, f"wait={seconds:g}")
     return seconds
-
-
-def streams(request: Request) -> bool:
-    """Whether the client asks for server-sent events."""
-    return preferred(field(request, "accept"), (JSON, EVENTS)) is EVENTS
 
 
 def _number(text: str) -> float:

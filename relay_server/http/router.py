@@ -258,7 +258,7 @@ class Router(Resource):
         :raises Unavailable: that relay can't be reached
         """
         forwarding, options = self._forwarding, bound.endpoint.options
-        if forwarding is None or request.http.forwarded is not None:
+        if forwarding is None or request.http.forwarded_client is not None:
             return False
         # Of the requests to a robot only those that stop it are proved from memory.
         stops = options.proved_from_memory
@@ -270,7 +270,7 @@ class Router(Resource):
             return False
         if relay is None:
             return False
-        request.forwarded = True
+        request.answered_elsewhere = True
         request.extend_time_limit(FORWARDED_SECONDS)
         client = ForwardedClient.of(request.principal, request.address)
         seconds = STOP_SECONDS if stops else None
@@ -280,7 +280,7 @@ class Router(Resource):
             if not stops or request.http.startedWriting:
                 raise
             # The stop is stored here, and carried out by the relay that reaches the robot.
-            request.forwarded = False
+            request.answered_elsewhere = False
             return False
         return True
 
@@ -289,10 +289,10 @@ class Router(Resource):
 
         :raises Unavailable: a relay that could have it can't be reached
         """
-        forwarding, first = self._forwarding, request.http.forwarded
+        forwarding, first = self._forwarding, request.http.forwarded_client
         if forwarding is None or (first is not None and first.final):
             return False
-        request.forwarded = True
+        request.answered_elsewhere = True
         request.extend_time_limit(FORWARDED_SECONDS)
         return await forwarding.forward_to_others(
             request.http, request.content(), request.principal, request.address
@@ -300,7 +300,7 @@ class Router(Resource):
 
     def _give_token(self, request: ApiRequest, endpoint: Endpoint) -> None:
         """Add a freshness token to the answer, also to an error."""
-        if endpoint.options.freshness is not Freshness.NONE and not request.forwarded:
+        if endpoint.options.freshness is not Freshness.NONE and not request.answered_elsewhere:
             request.http.setHeader(FRESHNESS, self._tokens.now())
 
     async def _authenticate(self, request: ApiRequest, endpoint: Endpoint, names: Mapping[str, str]) -> None:
@@ -430,7 +430,7 @@ def _form(request: ApiRequest, forms: tuple[MediaType, ...]) -> MediaType:
     if len(forms) == 1:
         return forms[0]
     request.http.responseHeaders.addRawHeader(b"vary", b"Accept")
-    choose = wanted if any(each.mark for each in forms) else preferred
+    choose = wanted if any(each.is_rdf for each in forms) else preferred
     return choose(field_lines(request.http, "accept"), forms)
 
 

@@ -383,7 +383,7 @@ class BoundedRequest(Request):
     """
 
     log = Logger()
-    forwarded: ForwardedClient | None = None
+    forwarded_client: ForwardedClient | None = None
     """The client of a request that another relay of the cluster has forwarded; it has authenticated the client."""
     from_listed_page = False
     """Whether a page of a listed origin sent this request, by its ``Origin``."""
@@ -461,7 +461,7 @@ class ForwardedRequest(BoundedRequest):
         """Check the secret, then serve the request for its client."""
         try:
             check_secret(self.getHeader(CLUSTER_HEADER), self.site.secret)
-            self.forwarded = ForwardedClient.parse(self.getHeader(CLIENT_HEADER) or "")
+            self.forwarded_client = ForwardedClient.parse(self.getHeader(CLIENT_HEADER) or "")
         except SwitchboardError as error:
             self.log.warn("{error}", error=error, limited="cluster")
             body = problem_of(self, error)
@@ -474,7 +474,8 @@ class ForwardedRequest(BoundedRequest):
 
     def getClientAddress(self) -> Any:
         """The address of the client."""
-        return client_address(self.forwarded) if self.forwarded is not None else super().getClientAddress()
+        first = self.forwarded_client
+        return super().getClientAddress() if first is None else client_address(first)
 
 
 class RelaySite(Site):

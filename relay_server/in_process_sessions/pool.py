@@ -17,6 +17,7 @@ from relay_server.access import Permit, Principal
 from relay_server.common import close_codes
 from relay_server.common.clock import Clock, Timer, cancel, sleep
 from relay_server.in_process_sessions.in_process_port import InProcessPort
+from relay_server.robots.registry import RobotState
 from relay_server.sessions.manager import Admission, SessionManager, ShuttingDown
 
 T = TypeVar("T")
@@ -115,10 +116,10 @@ class LatestValue:
             cancel(timer)
             self.touch()
 
-    async def poll(self, seconds: float) -> int:
+    async def wait_for_next(self, seconds: float) -> int:
         """Wait for the next message, or for ``seconds``.
 
-        :returns: the number of messages that came before the newest
+        :returns: the number with which :meth:`after` returns the newest message at once
 
         A client that polls again at once gets the newest of :data:`POLL_PACE`.
         """
@@ -292,18 +293,18 @@ class InProcessSessionPool:
         return None if entry is None else (entry.pooled, entry.enter())
 
     @asynccontextmanager
-    async def permit(self, caller: RobotCaller) -> AsyncIterator[Permit]:
-        """The present rights of the caller on the robot, without a session.
+    async def admitted(self, caller: RobotCaller) -> AsyncIterator[tuple[Permit, RobotState]]:
+        """The present rights of the caller on the robot, and the robot, without a session.
 
         :raises NotFound: no such robot, or no right on it
         """
         entry = self._entries.get(key_of(caller.principal, caller.robot))
         if entry is not None:
-            yield entry.pooled.client.permit
+            yield entry.pooled.client.permit, entry.pooled.client.robot
             return
         admission = await self._sessions.admit(*caller)
         try:
-            yield admission.permit
+            yield admission.permit, admission.robot
         finally:
             self._sessions.release(admission)
 

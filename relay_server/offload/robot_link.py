@@ -215,7 +215,7 @@ class FunctionLinkHandler(LinkHandler):
     def _reply(self, number: int, reply: FunctionReply) -> None:
         body = msgspec.msgpack.encode(reply)
         if not reply.final:
-            self.connection.send_sample(number, body)
+            self.connection.send_progress(number, body)
             return
         if self.connection.reply_bytes + len(body) > MAX_REPLY_BYTES:
             words = f"{self.connection.reply_bytes} bytes of results wait for the robot's slow link; call with keep"

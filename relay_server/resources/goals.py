@@ -499,7 +499,7 @@ class GoalService:
         """
         mine = self._store.of(GoalOwner.of(caller.principal), caller.robot)
         if not mine:
-            async with self._pool.permit(caller):
+            async with self._pool.admitted(caller):
                 pass
         matching = {id: goal for id, goal in mine.items() if fnmatchcase(goal.action, listing.name)}
         page, after = msgspec.structs.replace(listing, name="*").page(matching, lambda goal: [goal.type])

@@ -18,6 +18,7 @@ from twisted.python.failure import Failure
 from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.link import Service, Topic
 from relay_protocol.rights import Operation
+from relay_server.access import may_subscribe
 from relay_server.channels.names import resolve
 from relay_server.common.clock import Clock
 from relay_server.common.concurrency import FairLock, shield, with_timeout
@@ -120,7 +121,7 @@ class RobotResourceService:
 
         :raises NotFound: no such robot, or no right on it
         """
-        async with self._pool.permit(caller):
+        async with self._pool.admitted(caller):
             pass
 
     async def newest_message(self, caller: RobotCaller, name: str, wanted: MessageConditions) -> TopicState:
@@ -134,12 +135,13 @@ class RobotResourceService:
         async with self._pool.at(caller) as pooled:
             topic = resolve(name)
             type_name = visible_type(pooled.client, topic)
+            # Checks the right to subscribe, also of those whom an earlier request has subscribed.
             latest = pooled.subscribe(topic, type_name)
             until = self._clock.seconds() + wanted.wait
             known: TopicState | None = None
             number = 0
             if wanted.next:
-                number = await latest.poll(wanted.wait)
+                number = await latest.wait_for_next(wanted.wait)
                 until = self._clock.seconds()
             while True:
                 now = self._clock.seconds()
@@ -159,7 +161,7 @@ class RobotResourceService:
                     break
             if known is not None:
                 return known
-            # The right to subscribe may have been revoked meanwhile.
+            # Raises if the right to subscribe was revoked meanwhile.
             pooled.subscribe(topic, type_name)
             raise NothingReceived(f"no message on {topic} was received within {wanted.wait:g} s")
 
@@ -305,11 +307,23 @@ class RobotResourceService:
         :raises Refused: it may not
         """
         resource = resolve(name)
-        async with self._pool.permit(caller) as permit:
+        async with self._pool.admitted(caller) as (permit, _):
             decision = permit.decide(operation, resource)
         # Any right on the robot is enough for the relay's own services.
         own = operation is Operation.CALL and resource.startswith((f"{RELAY}/", f"{ROSAPI}/"))
         if not (decision.allowed or own):
+            raise Refused(decision.reason)
+
+    async def check_may_subscribe(self, caller: RobotCaller, name: str) -> None:
+        """Check that the caller may subscribe to a topic, without doing it.
+
+        :raises NotFound: no such robot, or no right on it
+        :raises Refused: it may not
+        """
+        topic = resolve(name)
+        async with self._pool.admitted(caller) as (permit, robot):
+            decision = may_subscribe(permit.decide, robot, topic)
+        if not decision.allowed:
             raise Refused(decision.reason)
 
     # --- parameters ---------------------------------------------------------------------------------------

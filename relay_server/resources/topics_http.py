@@ -17,7 +17,6 @@ from relay_server.common.clock import Clock, as_twisted
 from relay_server.common.tcp import NewsFlow
 from relay_server.http.endpoint import (
     ApiRequest,
-    Document,
     Endpoint,
     Freshness,
     IdempotencyKey,
@@ -55,7 +54,8 @@ NO_MATCH = (
 class TopicQuery(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Query for a message of a topic.
 
-    :param wait: seconds to wait for one; 2 by default
+    :param wait: seconds to wait for one, 2 by default; with `If-None-Match` for another one than the client has, and 0
+        answers at once
     :param max_age: largest age in seconds
     :param throttle_ms: of a stream: least time between two messages
     :param next: wait for a message that comes after the request; when none came in time, the newest one
@@ -104,12 +104,12 @@ class TopicEndpoints(GraphCollection):
     )
     async def newest_message(
         self, request: ApiRequest, robot: str, name: str, query: TopicQuery
-    ) -> Representation[TopicMessage] | Streamed | Document:
+    ) -> Representation[TopicMessage] | Streamed:
         head = request.http.method == b"HEAD"
         if request.form is EVENTS:
             stream = self._stream(request, robot, name, query)
             if head:
-                await self._service.may(caller_at(request, robot), Operation.SUBSCRIBE, name)
+                await self._service.check_may_subscribe(caller_at(request, robot), name)
             return stream
         if query.throttle_ms is not UNSET:
             raise Invalid("'throttle_ms' applies to streams: request text/event-stream, or remove it")
@@ -117,8 +117,8 @@ class TopicEndpoints(GraphCollection):
             raise Invalid("'whole' applies to streams: request text/event-stream, or remove it")
         if query.next and head:
             # Clients that poll ask for the head first, and do not wait for it.
-            await self._service.may(caller_at(request, robot), Operation.SUBSCRIBE, name)
-            return Document(b"", JSON.media)
+            await self._service.check_may_subscribe(caller_at(request, robot), name)
+            return Streamed(JSON.media, _send_nothing)
         wait = MessageConditions().wait if query.wait is UNSET else query.wait
         request.extend_time_limit(wait)
         max_age = None if query.max_age is UNSET else query.max_age
@@ -216,6 +216,10 @@ class TopicEndpoints(GraphCollection):
     @post.replay
     async def may_post(self, request: ApiRequest, robot: str, name: str, body: MessageBody) -> None:
         await self.may_put(request, robot, name, body)
+
+
+async def _send_nothing(http: Request) -> None:
+    """The body of an answer to HEAD."""
 
 
 def _keep_alive(http: Request, stream: TopicStream) -> None:

@@ -306,8 +306,8 @@ class RobotConnection(TwistedProtocol):
 
         return send_command if commands else send_sample
 
-    def send_sample(self, number: int, body: bytes) -> None:
-        """Queue a sample, in place of one of the same number that waits."""
+    def send_progress(self, number: int, body: bytes) -> None:
+        """Queue the progress of a function that the robot has called, in place of an earlier one that waits."""
         frame = pack_sample_head(len(body) + SAMPLE_HEAD, SAMPLE, number, 0) + body
         self._send_queue.send_droppable(number, frame, 1)
 

@@ -214,6 +214,8 @@ class RobotState:
     :param realm: the robot's own realm
     :param shared: other realms it is shared with
     :param elsewhere: whether it is connected to another relay of the cluster
+    :param control_link: its connection for messages of the link protocol, of which motion control is one kind;
+        ``None``: the robot is offline
     :param streams: most camera streams it encodes at a time; 0: the robot has sent none
     :param online_since: Unix time of the latest registration
     :param registrations: how often the robot has registered

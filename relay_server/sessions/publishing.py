@@ -142,6 +142,9 @@ class PublishHandler:
     def publish(self, operation: rosbridge.Publish) -> None:
         """Publish one message to the robot.
 
+        A port checks the quota of processor time only for long messages. Short ones are bounded by the share of a
+        reactor turn that a connection has (:data:`relay_server.ws.fast_receive.SHARE_SECONDS`) and by the send queue.
+
         A decision is valid while it was derived from the current objects: rules, description and control snapshot are
         replaced as a whole when they change. So decisions need no notification of changes.
 
@@ -189,6 +192,7 @@ class PublishHandler:
         """
         decision = self._decision(operation)
         publication = decision.publication
+        # The relay's description of the robot says that it moves it, or the robot's answer to ``advertise`` did.
         if decision.max_age_ns is not None or publication.motion:
             raise Refused(f"messages to {publication.topic} move the robot; send them as JSON")
         send = publication.send_encoded or self._client.channel.publications.encoded_sender(publication)
@@ -247,7 +251,7 @@ class PublishHandler:
     def _must_release(self, topic: str) -> bool:
         """Whether the client commanded without control, and has not released since (SPEC 1.7)."""
         controller, client = self._controller, self._client
-        if client.number in controller.snapshot.suppressed.get(topic, ()):
+        if client.number in controller.snapshot.suppressing.get(topic, ()):
             return False
         # Judged by the earliest time at which it can have been sent: a stalled link is not a release.
         return controller.lease.held_by(client) and self._streams.must_release(topic, self._age.earliest_sent)

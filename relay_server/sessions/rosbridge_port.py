@@ -80,7 +80,7 @@ class RosbridgePort(WebsocketPort):
                 self.message(data, None, joined)
             return
         quota, long = self._quota, len(data) > SMALL
-        if long and not quota.counting:
+        if long and not quota.being_timed:
             # Decoding a long message takes time that counts.
             with quota.timed():
                 self.message(data, None, joined)
@@ -100,7 +100,7 @@ class RosbridgePort(WebsocketPort):
         # Nearly all that clients send, so it skips the timing and the table of handlers.
         self._malformed = 0
         try:
-            if quota.counting:
+            if quota.being_timed:
                 quota.check()
             self._publish(operation)
         except SwitchboardError as error:
@@ -153,7 +153,7 @@ class RosbridgePort(WebsocketPort):
     def _unreadable(self, error: SwitchboardError, data: bytes) -> None:
         # JSON that is too costly, or NaN in the wrong place, does not count as malformed.
         self._malformed += isinstance(error, PeerError)
-        if not self._quota.counting:
+        if not self._quota.being_timed:
             self._quota.count_refusal()
         if isinstance(error, PeerError) and self._malformed == 1 and self._client.log_lines.take():
             self.log.info(

@@ -114,6 +114,7 @@ class Session:
         """
         kind, quota = type(operation), self.client.quota
         if isinstance(operation, rosbridge.Publish):
+            # Of Foxglove and of the relay's own clients; that of rosbridge goes straight to the handler.
             quota.check()
             self.publish_handler.publish(operation)
             return

@@ -23,16 +23,16 @@ class SessionQuota:
     :param user: the quota of its user, over all connections
     :param fair_queue: of all sessions of the robot that wait for its answer
     :param close: closes the connection with a code and a reason; the session replaces it
-    :ivar counting: whether the work done now is timed already; work nested in it is not timed again
+    :ivar being_timed: whether the work done now is timed already; work nested in it is not timed again
     """
 
-    __slots__ = ("_fair_queue", "close", "counting", "user")
+    __slots__ = ("_fair_queue", "being_timed", "close", "user")
 
     def __init__(self, user: UserQuota, fair_queue: FairQueue, close: Callable[[int, str], None]) -> None:
         self.user = user
         self._fair_queue = fair_queue
         self.close = close
-        self.counting = False
+        self.being_timed = False
 
     def check(self) -> None:
         """:raises Refused: the user's CPU quota is used up"""
@@ -54,16 +54,16 @@ class SessionQuota:
     @contextmanager
     def timed(self) -> Iterator[None]:
         """Around work that is done whether the quota is used up or not."""
-        if self.counting:
+        if self.being_timed:
             yield
             return
-        self.counting = True
+        self.being_timed = True
         worked = self.user.worked
         began = worked()
         try:
             yield
         finally:
-            self.counting = False
+            self.being_timed = False
             self._spent(worked() - began)
 
     async def wait_for_turn(self) -> None:
@@ -71,7 +71,7 @@ class SessionQuota:
 
         Many clients may wait for the same answer of a robot; their work must not be done all at once.
         """
-        if not self.counting:
+        if not self.being_timed:
             await self._fair_queue.wait()
 
     def count_elsewhere(self, seconds: float) -> None:

@@ -34,14 +34,14 @@ class SubscriptionHandler:
         self._client = client
         self._clock = clock
         self._local = local
-        self._subscriptions: dict[str, ClientSubscription] = {}
+        self._by_topic: dict[str, ClientSubscription] = {}
         self._timers = timers
         self._own_timer: PeriodicTimer | None = None
 
     def end(self) -> None:
         """The client is gone."""
         self._stop_own_timer()
-        for subscription in self._subscriptions.values():
+        for subscription in self._by_topic.values():
             subscription.close()
 
     def subscribe(self, operation: rosbridge.Subscribe) -> None:
@@ -53,14 +53,14 @@ class SubscriptionHandler:
         if not decision.allowed:
             raise Refused(decision.reason)
         encoding = encodings.requested_encoding(operation, client.notify, topic=True)
-        subscription = self._subscriptions.get(topic)
+        subscription = self._by_topic.get(topic)
         if subscription is None:
-            if len(self._subscriptions) >= SUBSCRIPTIONS:
+            if len(self._by_topic) >= SUBSCRIPTIONS:
                 raise Refused(f"at most {SUBSCRIPTIONS} topics can be subscribed on one connection")
             subscription = ClientSubscription(self._clock, client, topic)
         if self._local.topic(topic) is not None:
             subscription.add(operation, encoding)
-            self._subscriptions[topic] = subscription
+            self._by_topic[topic] = subscription
             if self._local.pushed(topic):
                 client.controller.changes.follow(client, self._publish_pushed)
                 self._publish_pushed()
@@ -68,16 +68,16 @@ class SubscriptionHandler:
                 self._own_timer = PeriodicTimer(self._publish_periodic, OWN_TOPICS_SECONDS)
                 self._timers.start(self._own_timer)
             return
-        subscriptions = client.channel.subscriptions
-        subscriptions.check(topic, type_name)
+        of_robot = client.channel.subscriptions
+        of_robot.check(topic, type_name)
         subscription.add(operation, encoding)
-        subscriptions.add(client, subscription, type_name, operation.qos)
-        self._subscriptions[topic] = subscription
+        of_robot.add(client, subscription, type_name, operation.qos)
+        self._by_topic[topic] = subscription
 
     def unsubscribe(self, operation: rosbridge.Unsubscribe) -> None:
         """End one subscription, or all to a topic."""
         topic = resolve(operation.topic)
-        subscription = self._subscriptions.get(topic)
+        subscription = self._by_topic.get(topic)
         if subscription is None:
             return
         if operation.id is not None and subscription.remove(operation.topic, operation.id):
@@ -88,14 +88,14 @@ class SubscriptionHandler:
 
     def is_subscribed(self, topic: str) -> bool:
         """Whether a topic is still subscribed."""
-        return topic in self._subscriptions
+        return topic in self._by_topic
 
     def recheck_rights(self) -> None:
         """End subscriptions that are no longer allowed, as rights or the types of topics have changed."""
-        for topic in list(self._subscriptions):
+        for topic in list(self._by_topic):
             decision = self._decide(topic)
             if not decision.allowed:
-                ids = self._subscriptions[topic].ids
+                ids = self._by_topic[topic].ids
                 self._end(topic)
                 for id in ids:
                     self._client.notify("error", f"unsubscribed from {topic}: {decision.reason}", id)
@@ -108,7 +108,7 @@ class SubscriptionHandler:
         return may_subscribe(client.permit.decide, client.robot, topic, [named] if named else ())
 
     def _end(self, topic: str) -> None:
-        subscription = self._subscriptions.pop(topic)
+        subscription = self._by_topic.pop(topic)
         subscription.close()
         self._client.port.forget(subscription)
         self._client.channel.subscriptions.remove(self._client, topic)
@@ -127,14 +127,12 @@ class SubscriptionHandler:
     def _publish_own(self, *, pushed: bool) -> bool:
         """Publish the relay's own topics of one kind; returns whether any is subscribed."""
         makers: list[tuple[str, Callable[[ClientContext], dict[str, Any]] | None]] = [
-            (name, self._local.topic(name))
-            for name in self._subscriptions
-            if self._local.pushed(name) is pushed
+            (name, self._local.topic(name)) for name in self._by_topic if self._local.pushed(name) is pushed
         ]
         for name, make in makers:
             if make is not None:
                 body = jsontext.encode(make(self._client))
-                subscription, sample = self._subscriptions[name], Sample(body, 0, _JSON)
+                subscription, sample = self._by_topic[name], Sample(body, 0, _JSON)
                 # A throttle must not delay a change of control.
                 subscription.replay(sample) if pushed else subscription.receive(sample)
         return any(make for _, make in makers)

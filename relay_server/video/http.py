@@ -333,7 +333,7 @@ class VideoResource(Resource):
         :raises BadCredentials: no valid credentials
         :raises Refused: a cookie that the browser sent for a page of another site
         """
-        if request.forwarded is not None:
+        if request.forwarded_client is not None:
             # Another relay has checked the credentials.
             return await in_time(request, self._principal_of(request))
         if not (request.getHeader("authorization") or "").lower().startswith("bearer "):
@@ -359,7 +359,7 @@ class VideoResource(Resource):
         :raises Unavailable: that relay can't be reached
         """
         forwarding = self._forwarding
-        if forwarding is None or request.forwarded is not None:
+        if forwarding is None or request.forwarded_client is not None:
             return False
         relay = await in_time(request, forwarding.relay_of(principal, robot, from_memory=False))
         if relay is None:

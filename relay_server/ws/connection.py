@@ -133,7 +133,7 @@ class ClientConnection(BoundedProtocol):
     def connectionMade(self) -> None:
         """The site has passed on a connection that requested a websocket."""
         super().connectionMade()
-        self._forwarded = self.factory.forwarded
+        self._forwarded = self.factory.forwarded_client
         self.limit_message_size(limits.UNAUTHENTICATED_BYTES)
         self._slot = self.factory.connection_limits.unauthenticated()
         # One deadline for handshake and authentication together; a session ends it.
@@ -616,7 +616,7 @@ class ClientFactory(WebSocketServerFactory):
     """``None``: this is the only relay."""
     takes_forwarded = True
     """Whether other relays may forward clients."""
-    forwarded: ForwardedClient | None = None
+    forwarded_client: ForwardedClient | None = None
     """The client of the request that a protocol is built for, if another relay has forwarded it."""
 
     def __init__(

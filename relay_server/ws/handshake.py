@@ -234,7 +234,7 @@ class WebSocketUpgrade(WebSocketResource):
     def render(self, request: Request) -> Any:
         """Pass the connection to Autobahn."""
         headers = request.requestHeaders
-        if request.forwarded is not None and not self._factory.takes_forwarded:
+        if request.forwarded_client is not None and not self._factory.takes_forwarded:
             return problem(request, 404, "This websocket is not forwarded; connect to the relay itself.")
         for name, values in list(headers.getAllRawHeaders()):
             if name.lower() in READ:
@@ -243,8 +243,8 @@ class WebSocketUpgrade(WebSocketResource):
             else:
                 headers.removeHeader(name)
         # Not in a header: Autobahn could read one out of what the client wrote.
-        self._factory.forwarded = request.forwarded
+        self._factory.forwarded_client = request.forwarded_client
         try:
             return super().render(request)
         finally:
-            self._factory.forwarded = None
+            self._factory.forwarded_client = None

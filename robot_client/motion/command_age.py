@@ -30,7 +30,7 @@ class CommandAge(enum.Enum):
 def freshness(stamp: int, now: int, offset: ClockOffset, deadline_ms: int) -> CommandAge:
     """Classify a command by the greatest age it can have.
 
-    :param stamp: the relay's monotonic clock, nanoseconds, see :class:`relay_protocol.frames.SampleFrame`
+    :param stamp: the relay's monotonic clock, nanoseconds, see :class:`relay_protocol.frames.CommandFrame`
     :param now: own monotonic clock, nanoseconds
     """
     oldest = offset.max_age(stamp, now)

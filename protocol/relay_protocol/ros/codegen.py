@@ -4,7 +4,8 @@ Definitions come from robots and are not trusted. Only field names get into the 
 written by :func:`repr`. Defaults, keys and formats are passed as objects. The size of the source is bounded.
 
 Generated code converts well-formed messages. For all others it raises one of :data:`SLOW_PATH_ERRORS`. The slow path
-(:mod:`reader`, :mod:`writer`) then converts the message, or says what is wrong with it.
+(:mod:`relay_protocol.ros.cdr_to_json`, :mod:`relay_protocol.ros.json_to_cdr`) then converts the message, or says
+what is wrong with it.
 """
 
 from __future__ import annotations

@@ -138,7 +138,7 @@ def _errors(endpoint: Endpoint) -> Iterator[int]:
 
 def _problems(endpoint: Endpoint) -> dict[int, Response]:
     found = {}
-    if any(each.mark for each in endpoint.options.forms):
+    if any(each.is_rdf for each in endpoint.options.forms):
         found[406] = Response("none of the accepted forms is available", Available, media=(PROBLEM,))
     if len(endpoint.options.reads) > 1:
         found[415] = Response("the form of the body is not supported", Available, media=(PROBLEM,))

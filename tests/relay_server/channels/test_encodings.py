@@ -171,7 +171,7 @@ def test_nan_stays_nan_in_cbor(world: World) -> None:
     person = world.person()
     for compression in ("none", "cbor"):
         person.says("subscribe", topic="/chatter", compression=compression)
-        listener = person.session.subscriptions._subscriptions["/chatter"]
+        listener = person.session.subscriptions._by_topic["/chatter"]
         person.context.deliver(listener, sample)
     plain, typed = map(opened, person.client.sent)
     assert plain["msg"] == {"ranges": [None, 1.5]}
@@ -326,7 +326,7 @@ def test_renderings_of_a_sample_are_bounded(world: World) -> None:
     (kept,) = world.channel.subscriptions.by_number[number].latched_samples._samples.values()
     for size in range(1000, 1100):
         person.says("subscribe", topic="/chatter", fragment_size=size)
-        listener = person.session.subscriptions._subscriptions["/chatter"]
+        listener = person.session.subscriptions._by_topic["/chatter"]
         person.context.deliver(listener, kept)
     assert kept.plain and kept._cached is not None
     others = sum(len(each.frames or b"") for each in kept._cached.values())

@@ -128,7 +128,7 @@ def test_subscriptions_of_one_client_to_one_topic_are_bounded(world: World) -> N
     for number in range(listener_module.MAX_REQUESTS):
         person.says("subscribe", topic="/chatter", throttle_rate=100, id=number)
     assert "at most 64" in person.received("status")[0]["msg"]
-    assert person.session.subscriptions._subscriptions["/chatter"].throttle == 0.1
+    assert person.session.subscriptions._by_topic["/chatter"].throttle == 0.1
 
 
 def test_late_joiners_get_the_latched_samples_of_every_publisher(world: World) -> None:

@@ -537,7 +537,7 @@ def test_control_ends_when_commands_stop(scene: ControlWorld) -> None:
     scene.service.message_received(link.MotionState(holder=ann.number))
     scene.clock.advance(601)
     assert scene.service.lease.state is LeaseState.FREE
-    assert ann.reported == ["you have lost control of rover: no command for 600 s"]
+    assert ann.reported == ["you have lost control of rover: no moving command for 600 s"]
 
 
 def test_no_state_remains_at_the_end(scene: ControlWorld) -> None:

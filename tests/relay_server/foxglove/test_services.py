@@ -169,7 +169,7 @@ def test_the_time_to_read_a_long_binary_message_is_counted(
     world.settle(client)
     number = services(client)["/reset"]["id"]
     counting: list[bool] = []
-    monkeypatch.setattr(SessionQuota, "check", lambda quota: counting.append(quota.counting))
+    monkeypatch.setattr(SessionQuota, "check", lambda quota: counting.append(quota.being_timed))
     for length in (10, 5000):
         calls(client, number, 1, b"{}" + b" " * length, b"json")
     assert counting[0] is False

@@ -344,7 +344,7 @@ def test_only_commands_that_move_the_robot_keep_control_of_it(
         world.wait(10, ann)
         drive(ann, msg)
     lost = [why for kind, _, why, _ in world.record.notes if kind == "control.lost"]
-    assert lost == ([] if held else ["no command for 600 s"])
+    assert lost == ([] if held else ["no moving command for 600 s"])
     assert len(passed(world)) >= 59
 
 
