@@ -175,6 +175,7 @@ def require_finite(text: bytes) -> None:
 
     :param text: JSON that was checked; NaN and infinity are marks
     :raises NotFinite: with the field
+    :raises Invalid: it is ``null`` itself
     :raises TooCostly: see :func:`relay_protocol.json_cost.check_odd`
     """
     # Marks have this escape, however they are written. Nearly all commands have neither.
@@ -184,9 +185,9 @@ def require_finite(text: bytes) -> None:
     found = _not_finite(jsontext.decode_any(text))
     if found is not None:
         path, value = found
-        raise NotFinite(
-            f"{display_name(path) or 'the message'} must be finite in a command that moves the robot, not {value}"
-        )
+        if not path:
+            raise Invalid("the message must be an object, not null")
+        raise NotFinite(f"{display_name(path)} must be finite in a command that moves the robot, not {value}")
 
 
 def _not_finite(value: Any, path: str = "") -> tuple[str, str] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from relay_protocol import link, rosbridge
+from relay_protocol import link, nonfinite, rosbridge
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import KIB
 from relay_protocol.release_rule import RELEASE_NS, CommandStreams
@@ -262,6 +262,7 @@ class PublishHandler:
         :returns: whether it passes now; otherwise it waits until this client has control
 
         :raises Refused: as :meth:`_queue_and_request_control`, or the client must release the controls first
+        :raises SwitchboardError: as :meth:`_check_finite`
         """
         topic = decision.publication.topic
         if not self._controller.may_command(self._client, topic):
@@ -271,6 +272,7 @@ class PublishHandler:
                 self._streams.zero(topic)
                 self._controller.check_zero_command(self._client)
                 return True
+            self._check_finite(decision, operation)
             self._queue_and_request_control(decision, operation, is_zero)
             return False
         if self._must_release(topic):
@@ -283,6 +285,17 @@ class PublishHandler:
             )
         decision.passes = True
         return True
+
+    def _check_finite(self, decision: PublishDecision, operation: rosbridge.Publish) -> None:
+        """Check a command before it acquires control. Those of the holder are checked when they are converted.
+
+        :raises SwitchboardError: a number in it is not finite, or it takes too long to find out
+        """
+        try:
+            nonfinite.require_finite(bytes(operation.msg))
+        except SwitchboardError as error:
+            self._record_refused(decision, zero=False)
+            raise type(error)(f"publish {decision.publication.topic}: {error}") from None
 
     def _only_stops(self, decision: PublishDecision) -> bool:
         """Whether a zero passes without acquiring control, because it only stops the robot.

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import pytest
+from websockets.sync.client import connect
 
+from relay_server.icpi.messages import IcpiMessage, parse, write
 from tests.worlds.json_robots import JsonRobot
 from tests.worlds.processes import running
 from tests.worlds.relay_process import Relay
-from tests.worlds.waiting import wait_for
+from tests.worlds.waiting import PATIENCE, wait_for
 
 ROLE = "Thermometer-Drive-Wheels"
 DOCUMENT = """
@@ -147,6 +150,77 @@ def test_set_moves_the_robot_by_the_rules_of_a_client(world: World) -> None:
         ]
 
     wait_for("it is in the audit log", lambda: f"{ROLE}/SPEED@default" in audited())
+
+
+def test_a_number_that_is_not_finite_moves_no_robot_by_icpi(world: World) -> None:
+    """A program sets an element of a Role."""
+    with connect(
+        f"ws://127.0.0.1:{world.relay.http_port}/icpi",
+        additional_headers={"Authorization": f"Bearer {world.tokens['ann']}"},
+        open_timeout=PATIENCE,
+    ) as program:
+
+        def refusal() -> str:
+            program.send(write(IcpiMessage(ROLE, "test", 1, False, "set", ("SPEED", "NaN"))))
+            result, words = parse(str(program.recv(PATIENCE))).args
+            assert result == "error"
+            # Until a ping proves how old its messages are; commands are limited for each user.
+            return "" if "older" in words or "too often" in words else words
+
+        assert "must be finite" in wait_for("a command by ICPI is judged", refusal)
+    assert world.ask("ann", "GET", "DRIVEN").json()["value"]["linear"]["x"] == 0
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", "null"])
+def test_a_number_that_is_not_finite_moves_no_robot_by_any_entry(world: World, number: str) -> None:
+    """HTTP, which Things use too, the fleet, elements by HTTP and rosbridge, and a published message."""
+    topic, twist = "/robots/rover/topics/cmd_vel", f'{{"linear":{{"x":{number}}}}}'
+    requests = (
+        ("PUT", topic, f'{{"value":{twist}}}'),
+        ("POST", topic, f'{{"value":{twist}}}'),
+        ("PUT", f"/roles/{ROLE}/elements/SPEED", f'{{"value":{number}}}'),
+        ("POST", "/fleet", f'{{"robots":["rover"],"do":"publish","topic":"/cmd_vel","msg":{twist}}}'),
+    )
+    errors = {}
+    for method, path, body in requests:
+        headers = {"Content-Type": "application/json", **world.fresh()}
+        answer = world.clients["ann"].request(method, path, content=body, headers=headers)
+        assert not answer.is_success or '"ok":false' in answer.text, answer.text
+        errors[method, path] = answer.text
+    with world.relay.connect("rover", world.tokens["ann"]) as client:
+        client.send(op="set_level", level="warning")
+        assert client.call("/relay/take_control")["result"]
+        level = "warning"
+        # Until the robot has the publisher, a command may become too old.
+        while level == "warning":
+            client.connection.send(f'{{"op":"publish","id":"p","topic":"/cmd_vel","msg":{twist}}}')
+            status = client.until(op="status", id="p")
+            level, errors["rosbridge", "publish"] = status["level"], status["msg"]
+        assert client.call("/relay/release_control")["result"]
+        element = {"role": ROLE, "element": "SPEED", "value": number}
+        given = client.call("/relay/set_element", element)
+        assert not given["result"] or not given["values"]["success"]
+        errors["rosbridge", "set"] = str(given["values"])
+    unclear = {
+        each: text for each, text in errors.items() if not re.search(r"finite|range|NaN|null|JSON", text)
+    }
+    assert not unclear
+    assert world.ask("ann", "GET", "DRIVEN").json()["value"]["linear"]["x"] == 0
+
+
+def test_a_pipe_whose_product_is_infinite_moves_no_robot(world: World) -> None:
+    """Its table of fields multiplies a temperature by more than a double can hold."""
+    fields = [{"source": "data", "target": "linear.x", "scale": 1e308}]
+    pipe = {**PIPE, "name": "hot", "fields": fields, "start": True}
+    world.clients["ann"].post("/pipes", json=pipe).raise_for_status()
+
+    def problem() -> str:
+        return str(world.clients["ann"].get("/pipes/hot").json()["why"])
+
+    wait_for("its drops say why", lambda: re.search("finite|range", problem()))
+    assert world.ask("ann", "GET", "DRIVEN").json()["value"]["linear"]["x"] == 0
+    world.clients["ann"].delete("/pipes/hot").raise_for_status()
+    world.clients["ann"].post("/robots/rover/services/relay/release_control")
 
 
 def test_call_start_and_stop(world: World) -> None:

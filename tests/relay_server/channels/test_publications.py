@@ -457,7 +457,6 @@ OWN_TEXT = "int64 whole\nfloat64[] many\nfloat32 one\nuint8[] raw\nstring text\n
         ("/cmd_vel", TWIST, '{"linear":{"x":true}}', "linear.x must be a number, not a boolean"),
         ("/cmd_vel", TWIST, '{"linear":{"x":"1"}}', "linear.x must be a number, not a string"),
         ("/cmd_vel", TWIST, '"1"', "must be an object, not a string"),
-        ("/cmd_vel", TWIST, "null", "must be an object, not null"),
         ("/cmd_vel", TWIST, "[1]", "must be an object, not an array"),
         ("/cmd_vel", TWIST, '{"linear":{"w":1}}', "linear.w is no field of geometry_msgs/msg/Vector3"),
         ("/own", OWN, '{"whole":9223372036854775808}', "whole is out of range for int64"),
@@ -478,6 +477,17 @@ def test_a_robot_of_json_is_sent_nothing_that_is_not_of_the_type(
     assert person.reported() == [
         f"publish {topic}: {type_name}{'' if reason.startswith('must') else ':'} {reason}"
     ]
+    assert not world.link.samples
+
+
+def test_a_command_is_no_null(world: World) -> None:
+    """It is refused before it acquires control."""
+    person = json_robot(world)
+    person.rosbridge.message(
+        f'{{"op":"publish","id":"p","topic":"/cmd_vel","type":"{TWIST}","msg":null}}'.encode()
+    )
+    tells(world)
+    assert person.reported() == ["publish /cmd_vel: the message must be an object, not null"]
     assert not world.link.samples
 
 

@@ -72,13 +72,13 @@ def test_waiting_ends_when_no_message_can_come(feed: LatestValue, clock: Clock) 
 def test_a_poll_waits_for_a_message_from_now_on(feed: LatestValue, clock: Clock) -> None:
     feed.update(b"1")
     polled: list[int] = []
-    Deferred.fromCoroutine(feed.poll(5)).addCallback(polled.append)
+    Deferred.fromCoroutine(feed.wait_for_next(5)).addCallback(polled.append)
     feed.update(b"2")
     feed.update(b"3")
     assert not polled
     clock.advance(0.1)
     assert polled == [2]
-    Deferred.fromCoroutine(feed.poll(5)).addCallback(polled.append)
+    Deferred.fromCoroutine(feed.wait_for_next(5)).addCallback(polled.append)
     clock.advance(5)
     clock.advance(0)
     assert polled == [2, 2]

@@ -194,17 +194,18 @@ async def test_rights_are_listed_without_a_connection(
 ) -> None:
     """An existing connection is used; no state is left."""
     ann, _ = await front.logged_in()
-    async with pool.permit(RobotCaller(ann, "rover", HERE)) as permit:
+    async with pool.admitted(RobotCaller(ann, "rover", HERE)) as (permit, robot):
         assert permit.decide(Operation.CALL, "/reset").allowed
         assert not list(front.service)
     assert not front.access._permits
     async with (
         pool.at(RobotCaller(ann, "rover", HERE)) as pooled,
-        pool.permit(RobotCaller(ann, "rover", HERE)) as permit,
+        pool.admitted(RobotCaller(ann, "rover", HERE)) as (permit, known),
     ):
         assert permit is pooled.client.permit
+        assert known is robot is pooled.client.robot
     with pytest.raises(NotFound):
-        async with pool.permit(RobotCaller(ann, "hidden", HERE)):
+        async with pool.admitted(RobotCaller(ann, "hidden", HERE)):
             raise AssertionError
 
 

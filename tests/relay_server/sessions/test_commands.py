@@ -87,6 +87,24 @@ def test_a_robot_marks_a_motion_topic_when_it_advertises_it(world: World) -> Non
     assert [source for _, _, source, _ in world.link.commands] == [ann.context.number]
 
 
+@pytest.mark.parametrize("number", ["NaN", "null"])
+def test_a_command_that_is_not_finite_acquires_no_control(world: World, number: str) -> None:
+    """Of a free robot. It counts as one that was refused."""
+    at_work(world)
+    ann = driver(world, "ann", 1)
+    world.define()
+    ann.rosbridge.ping()
+    ann.answers_pings()
+    ann.rosbridge.message(
+        f'{{"op":"publish","topic":"/cmd_vel","msg":{{"linear":{{"x":{number}}}}}}}'.encode()
+    )
+    assert ann.reported() == [
+        f"publish /cmd_vel: linear.x must be finite in a command that moves the robot, not {number}"
+    ]
+    assert world.control.all(link.ControlGrant) == []
+    assert world.link.commands == []
+
+
 def test_the_newest_command_waits_until_the_robot_has_agreed(world: World) -> None:
     """Earlier ones are dropped: a program that publishes once is obeyed, and no command is repeated."""
     at_work(world)

@@ -21,7 +21,9 @@ from robot_client.modules.process_table import ProcessTable, program_name
 
 PARENT = """
 import subprocess, sys
-child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+program = "print(flush=True); input()"
+child = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+child.stdout.readline()
 print(child.pid, flush=True)
 input()
 child.stdin.close()
