@@ -69,7 +69,7 @@ class ChangeWatcher:
         """
         self._revision = await self._store.read(queries.revision)
         self._registry.share(await self._store.read(queries.robot_shares))
-        self._controllers.stored_stops_read(await self._store.read(queries.pending_stops))
+        await self._controllers.read_stored_stops()
         await self._realms.refresh()
 
     async def apply(self) -> None:
@@ -91,7 +91,7 @@ class ChangeWatcher:
         await self._access.refresh()
         await self._realms.refresh()
         await remove_deleted(self._store, self._registry, self._controllers, self._videos)
-        self._controllers.stored_stops_read(await self._store.read(queries.pending_stops))
+        await self._controllers.read_stored_stops()
         await self._alerts.refresh()
         self._leases.check_soon()
         # Not awaited: rights must be applied even if the disk is slow.

@@ -146,7 +146,7 @@ class _StopOrder:
             )
             for each in robots:
                 if each.full not in result:
-                    new = queries.order_stop_once(
+                    new = queries.store_stop_once(
                         change.session, each.id, os_user(), self._why, time.time(), self._stop_id
                     )
                     if new:
@@ -161,7 +161,7 @@ def _cancel_stop(app: App, robot: str, why: str) -> None:
     """
     with app.change() as change:
         found = change.robot(robot)
-        if not queries.remove_stop(change.session, found.id):
+        if not queries.delete_stop(change.session, found.id):
             raise Unavailable(
                 "no relay runs on this data folder, and no stop of this robot is waiting to be sent; "
                 "a stop that the robot has confirmed can be resumed only while it is online"
@@ -177,4 +177,4 @@ def _outcome_text(result: dict[str, Any]) -> str:
         # The reason of a stop that was done in part is a sentence about the robot.
         reason = str(result["reason"])
         return f"{reason[:1].upper()}{reason[1:]}" if result.get("stopped") else f"Robot {robot}: {reason}"
-    return f"Robot {robot} cannot be reached now; it will be stopped as soon as it comes back."
+    return f"Robot {robot} will be stopped as soon as it can be reached."

@@ -1,4 +1,7 @@
-"""Orders to many robots, for those whose home is another relay: each is sent there as an order to one robot."""
+"""Orders to many robots, for those whose home is another relay: each is sent there as an order to one robot.
+
+Stops are not sent this way. They are stored in the database, which the home reads at once.
+"""
 
 from __future__ import annotations
 

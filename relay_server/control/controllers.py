@@ -74,7 +74,7 @@ class Controllers:
             )
             stored = self._stored_stops.pop(robot.robot_id, None)
             if stored is not None:
-                controller.stopping.add_stored(stored.stop, stored.seen)
+                controller.stopping.add_stored(stored.stop, stored.seen, stored.seen)
         return controller
 
     def snapshot(self, robot_id: int) -> ControlSnapshot:
@@ -98,11 +98,19 @@ class Controllers:
 
         :raises SwitchboardError: the database does not answer
         """
+        read_at = self._clock_ns()
         stop = await self._stop_store.pending_stop(robot)
-        self.of(robot).stopping.add_stored(stop, self._clock_ns())
+        self.of(robot).stopping.add_stored(stop, self._clock_ns(), read_at)
 
-    def stored_stops_read(self, stops: Iterable[StopRecord]) -> None:
-        """Add the stops that were read from the database, and send new ones to robots that are online."""
+    async def read_stored_stops(self) -> None:
+        """Read the stops stored in the database, and send new ones to robots that are online.
+
+        :raises SwitchboardError: the database does not answer
+        """
+        read_at = self._clock_ns()
+        self._take_stored(await self._stop_store.pending_stops(), read_at)
+
+    def _take_stored(self, stops: Iterable[StopRecord], read_at: int) -> None:
         now, before = self._clock_ns(), self._stored_stops
         self._stored_stops = {stop.robot_id: _StoredStop(stop, now) for stop in stops}
         for robot_id, known in before.items():
@@ -110,7 +118,10 @@ class Controllers:
                 self._stored_stops[robot_id] = known
         for controller in self:
             stop, seen = self._stored_stops.pop(controller.robot.robot_id, (None, now))
-            if controller.stopping.add_stored(stop, seen) and controller.robot.control_link is not None:
+            if (
+                controller.stopping.add_stored(stop, seen, read_at)
+                and controller.robot.control_link is not None
+            ):
                 controller.stopping.send_pending()
 
     def forget(self, robot_id: int) -> None:

@@ -99,8 +99,8 @@ class StopProblemError(NotDone):
 class ControlEndpoints:
     """Control of robots."""
 
-    def __init__(self, service: ControlGateway) -> None:
-        self._gateway = service
+    def __init__(self, gateway: ControlGateway) -> None:
+        self._gateway = gateway
 
     async def check_may_know(self, request: ApiRequest, robot: str) -> None:
         """:raises NotFound: the sender may not know of the robot"""
@@ -219,6 +219,7 @@ class ControlEndpoints:
         raw_optional=True,
         freshness=Freshness.GIVEN,
         proved_from_memory=True,
+        stored_if_unreachable=True,
         never_limited=True,
         # The robot is stopped even if the client leaves.
         shielded=True,
@@ -245,6 +246,7 @@ class ControlEndpoints:
         raw_optional=True,
         freshness=Freshness.GIVEN,
         proved_from_memory=True,
+        stored_if_unreachable=True,
         never_limited=True,
         shielded=True,
     )

@@ -3,6 +3,8 @@
 Websocket clients come from :mod:`relay_server.relay_node.control`, HTTP and the admin socket from
 :mod:`relay_server.control.gateway`, orders to many robots from :mod:`relay_server.fleet`. Motion commands that
 acquire control are checked one by one in :meth:`relay_server.control.controller.RobotController.acquire_by_command`.
+Stops that the command line or another relay has stored in the database are read by
+:meth:`relay_server.control.controllers.Controllers.read_stored_stops`.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class StopIds:
 
     One id of one user is one stop, by whatever paths it arrives: each later arrival is a duplicate. As ids are
     separated, no user can pass off another's stop as a duplicate of their own. The command line has the same rule for
-    what it stores: :func:`relay_db.queries.order_stop_once`. The robot knows no ids: a stop that comes again is done
+    what it stores: :func:`relay_db.queries.store_stop_once`. The robot knows no ids: a stop that comes again is done
     again.
     """
 
@@ -160,6 +160,9 @@ class StopController:
         """When a duplicate last arrived; Unix time, seconds."""
         self._pending: StopRecord | None = None
         """A stop that the robot has not confirmed."""
+        self._stored_since: int | None = None
+        """Since when the pending stop has been in the database, the relay's monotonic nanoseconds; ``None``: it may not
+        be stored yet."""
         self._incomplete: StopRecord | None = None
         """A stop that the robot received but could not carry out completely. It may be without it when it returns."""
         self._check_state = False
@@ -197,7 +200,7 @@ class StopController:
         audit = first or self._further_audits.take(actor.source)
         if self._pending is None or not self._writer.full:
             # When the writer is full, the pending stop is being written, and a further one is only sent.
-            self._pending = stop
+            self._pending, self._stored_since = stop, None
         self._changed()
         return detached(self._stop(stop, None if duplicate else actor, audit))
 
@@ -246,6 +249,8 @@ class StopController:
         await self._writer.save(stop)
         if self._pending is None:
             self._writer.delete(stop)
+        elif self._pending is stop:
+            self._stored_since = self._clock_ns()
 
     def _set_confirmed(self, stop: StopRecord) -> None:
         """The robot has the stop: show it as confirmed, and send it no more."""
@@ -347,29 +352,41 @@ class StopController:
 
     # --- the robot ----------------------------------------------------------------------------------------
 
-    def add_stored(self, stop: StopRecord | None, seen: int) -> bool:
+    def add_stored(self, stop: StopRecord | None, seen: int, read_at: int) -> bool:
         """Add a stop stored in the database; return whether it is new. The caller sends it.
 
         Every relay reads the stops again whenever the database has changed, so most are known already.
 
+        :param stop: ``None``: none is stored for this robot
         :param seen: when it was first read from there, the relay's monotonic nanoseconds
+        :param read_at: when the present reading began, as ``seen``
         """
         if stop is None:
+            self._check_ended_elsewhere(read_at)
             return False
         if self._writer.is_known(stop):
             if self._pending is None:
                 self._writer.delete(stop)
             return False
-        self._writer.note(stop)
+        self._writer.note(stop, read=True)
         if self.stopped is None:
             self._forget_requests()
         # The command line has stored it if no relay answered. It may have arrived here all the same, or still arrive.
         if self._ids.is_duplicate(local_actor(stop.by), stop.stop_id):
             self._duplicate_at = stop.at
         self._last_stopped_at = max(self._last_stopped_at, seen)
-        self._pending = stop
+        self._pending, self._stored_since = stop, seen
         self._changed()
         return True
+
+    def _check_ended_elsewhere(self, read_at: int) -> None:
+        """Forget a pending stop that is stored no longer: the relay with the robot had it confirmed, or withdrawn.
+
+        :param read_at: when the reading began that has not found it
+        """
+        stored, offline = self._stored_since, self._robot.control_link is None
+        if self._pending is not None and offline and stored is not None and stored < read_at:
+            self._clear_pending(self._pending)
 
     def robot_online(self) -> None:
         """Send the robot a stop that it has not confirmed.

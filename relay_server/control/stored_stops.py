@@ -40,15 +40,24 @@ class PendingStops(Protocol):
         :raises SwitchboardError: it could not be written
         """
 
-    async def delete_stop(self, robot: RobotState, at: float | None = None) -> bool:
+    async def delete_stop(
+        self, robot: RobotState, at: float | None = None, *, announce: bool = False
+    ) -> bool:
         """Delete a stop of a robot; return whether there was one.
 
         :param at: time of the stop, Unix seconds, which identifies it; ``None`` for any
+        :param announce: whether another relay waits for its end, as it has stored it
         :raises SwitchboardError: the database does not answer
         """
 
     async def pending_stop(self, robot: RobotState) -> StopRecord | None:
         """The stored stop that the robot has not confirmed.
+
+        :raises SwitchboardError: the database does not answer
+        """
+
+    async def pending_stops(self) -> list[StopRecord]:
+        """The stored stops that robots have not confirmed.
 
         :raises SwitchboardError: the database does not answer
         """
@@ -70,16 +79,22 @@ class DatabasePendingStops:
         """See :class:`PendingStops`."""
         announce = self._announce(stop.robot_id)
         await self._store.write(
-            queries.order_stop, stop.robot_id, stop.by, stop.why, stop.at, stop.stop_id, announce=announce
+            queries.store_stop, stop.robot_id, stop.by, stop.why, stop.at, stop.stop_id, announce=announce
         )
 
-    async def delete_stop(self, robot: RobotState, at: float | None = None) -> bool:
+    async def delete_stop(
+        self, robot: RobotState, at: float | None = None, *, announce: bool = False
+    ) -> bool:
         """See :class:`PendingStops`."""
-        return await self._store.write(queries.remove_stop, robot.robot_id, at)
+        return await self._store.write(queries.delete_stop, robot.robot_id, at, announce=announce)
 
     async def pending_stop(self, robot: RobotState) -> StopRecord | None:
         """See :class:`PendingStops`."""
         return await self._store.read(queries.pending_stop, robot.robot_id)
+
+    async def pending_stops(self) -> list[StopRecord]:
+        """See :class:`PendingStops`."""
+        return await self._store.read(queries.pending_stops)
 
 
 class StopWriter:
@@ -93,6 +108,8 @@ class StopWriter:
         self._store = store
         self._known_times: deque[float] = deque(maxlen=REMEMBERED_STOPS)
         """Times of all stops that this relay has sent or read."""
+        self._read_times: deque[float] = deque(maxlen=REMEMBERED_STOPS)
+        """Those that it has read: the command line or another relay has stored them."""
         self._saving: list[StopRecord] = []
         """Stops whose write is under way."""
         self._times_to_delete: deque[float] = deque(maxlen=REMEMBERED_STOPS)
@@ -108,9 +125,14 @@ class StopWriter:
         """Whether a stop that was read from the database is not new here."""
         return stop.at in self._known_times
 
-    def note(self, stop: StopRecord) -> None:
-        """Note a stop that is sent or was read, so that it is known from now on."""
+    def note(self, stop: StopRecord, *, read: bool = False) -> None:
+        """Note a stop that is sent or was read, so that it is known from now on.
+
+        :param read: whether it was read from the database
+        """
         self._known_times.append(stop.at)
+        if read:
+            self._read_times.append(stop.at)
 
     async def save(self, stop: StopRecord) -> None:
         """Store a stop.
@@ -131,7 +153,7 @@ class StopWriter:
 
         :raises SwitchboardError: the database does not answer
         """
-        await self._store.delete_stop(self._robot, stop.at)
+        await self._store.delete_stop(self._robot, stop.at, announce=stop.at in self._read_times)
 
     def delete(self, stop: StopRecord) -> None:
         """Delete a stop in the background, so that no later relay sends it. One that is being written stays."""
@@ -146,7 +168,7 @@ class StopWriter:
             while self._times_to_delete:
                 at = self._times_to_delete[0]
                 try:
-                    await self._store.delete_stop(self._robot, at)
+                    await self._store.delete_stop(self._robot, at, announce=at in self._read_times)
                 except SwitchboardError as error:
                     self.log.warn(
                         "a confirmed or withdrawn stop of {robot} cannot be deleted from the database: {reason}",

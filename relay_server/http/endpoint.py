@@ -288,6 +288,8 @@ class EndpointOptions:
     :param raw_body: type of a body that the handler itself reads (:meth:`ApiRequest.content`)
     :param raw_optional: whether such a body may be omitted
     :param proved_from_memory: a token that was proved before needs no database, so a slow one does not delay it
+    :param stored_if_unreachable: it is a stop: where the relay that has the robot can't be reached, it is stored here,
+        and sent by the relay that reaches the robot
     :param never_limited: it stops something, so no rate limit applies. A function decides by the request and its
         path parameters
     :param shielded: it has no time limit, and continues when the client disconnects. A function decides by the body
@@ -320,6 +322,7 @@ class EndpointOptions:
     freshness: Freshness = Freshness.NONE
     if_match: bool = False
     proved_from_memory: bool = False
+    stored_if_unreachable: bool = False
     never_limited: bool | Callable[[ApiRequest, Mapping[str, str]], bool] = False
     shielded: bool | Callable[[bytes], bool] = False
     detached: bool = False

@@ -1,6 +1,5 @@
-"""Lists that pages show: looked up once for all pages of a user, held once for all pages that show the same.
-
-Updates of one page: lists of robots and alerts, at every change and so often that silence means a lost relay.
+"""Lists that pages of the portal show, of robots and of alerts: looked up once for all pages of a user, held once for
+all that show the same, and sent at every change and so often that silence means a lost relay.
 
 A reader must not learn of a change that is hidden from them. So an update is sent only if what the reader may see
 differs. A repeated update comes a fixed time after the last one, whatever happened in between.

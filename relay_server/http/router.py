@@ -260,10 +260,9 @@ class Router(Resource):
         forwarding, options = self._forwarding, bound.endpoint.options
         if forwarding is None or request.http.forwarded_client is not None:
             return False
-        # Of the requests to a robot only those that stop it are proved from memory.
-        stops = options.proved_from_memory
+        urgent = options.proved_from_memory
         if options.path.startswith(ROBOT):
-            relay = await forwarding.relay_of(request.principal, names["robot"], from_memory=stops)
+            relay = await forwarding.relay_of(request.principal, names["robot"], from_memory=urgent)
         elif hasattr(bound.group, "relay_of"):
             relay = await bound.group.relay_of(request, **names)
         else:
@@ -273,13 +272,12 @@ class Router(Resource):
         request.answered_elsewhere = True
         request.extend_time_limit(FORWARDED_SECONDS)
         client = ForwardedClient.of(request.principal, request.address)
-        seconds = STOP_SECONDS if stops else None
+        seconds = STOP_SECONDS if urgent else None
         try:
             await forwarding.forwarder.forward(request.http, request.content(), relay, client, seconds)
         except Unavailable:
-            if not stops or request.http.startedWriting:
+            if not options.stored_if_unreachable or request.http.startedWriting:
                 raise
-            # The stop is stored here, and carried out by the relay that reaches the robot.
             request.answered_elsewhere = False
             return False
         return True

@@ -53,7 +53,7 @@ class ControlRosServices:
         """``/relay/stop``: any right on the robot is enough, which every session has.
 
         ``done``: the robot has done all of it. If it has not, ``success`` is true when it stops as soon as it is back,
-        and false when a part of the stop failed or nothing is known. Only then is ``stopped`` null.
+        and false when a part of the stop failed or nothing is known. ``stopped`` is null only when nothing is known.
         """
         why, stop_id = stop_arguments(args)
         try:

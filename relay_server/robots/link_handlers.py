@@ -1,5 +1,5 @@
-"""Roles of a robot's connection (SPEC 2): handshake, control link, channel link, link of a camera
-stream, file link.
+"""Handlers of a robot's connections, one for each purpose (SPEC 2): handshake, control link, channel link, link of a
+camera stream, file link.
 
 hello → challenge → prove → control link     enroll → enrolled → closed     join → channel, stream or files
 """

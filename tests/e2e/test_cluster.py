@@ -116,10 +116,14 @@ class Fleet:
 
     def state(self, relay: Relay) -> str:
         """The robot's state in a relay's list."""
+        return str(self.listed(relay)["state"])
+
+    def listed(self, relay: Relay) -> dict[str, Any]:
+        """The robot in a relay's list."""
         url = f"http://127.0.0.1:{relay.http_port}/api/v1/robots"
         headers = {"Authorization": f"Bearer {self.token}"}
         answer = httpx.get(url, headers=headers, timeout=PATIENCE).json()
-        return str(next(each["state"] for each in answer["robots"] if each["name"] == "rover"))
+        return dict(next(each for each in answer["robots"] if each["name"] == "rover"))
 
 
 def say(robot: SmallRobot, arguments: Any) -> dict[str, Any]:
@@ -276,6 +280,9 @@ def test_an_order_to_many_robots_reaches_those_of_other_relays(fleet: Fleet) -> 
     assert results[0]["values"] == {"success": True, "message": "hello"}
     fleet.second.run_cli("stop", "rover")
     wait_for("it is stopped", lambda: fleet.robot.stopped is not None)
+    wait_for(
+        "the relay that took the order has its end", lambda: fleet.listed(fleet.second)["stopped"] is None
+    )
     fleet.resume(fleet.first)
     wait_for("it may move", lambda: fleet.robot.stopped is None)
 

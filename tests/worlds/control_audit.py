@@ -28,6 +28,8 @@ class MemoryRecord:
         self.fails: SwitchboardError | None = None
         self.hold = False
         """Whether what is to be written waits for ever."""
+        self.deleted: list[tuple[float | None, bool]] = []
+        """Times of the stops that were to be deleted, and whether that was to be announced."""
         self.held: list[Deferred[None]] = []
 
     def note(
@@ -54,9 +56,12 @@ class MemoryRecord:
             await self.held[-1]
         self.stops[stop.robot_id] = stop
 
-    async def delete_stop(self, robot: RobotState, at: float | None = None) -> bool:
+    async def delete_stop(
+        self, robot: RobotState, at: float | None = None, *, announce: bool = False
+    ) -> bool:
         """Returns whether there was one."""
         self._check()
+        self.deleted.append((at, announce))
         kept = self.stops.get(robot.robot_id)
         if kept is None or at not in (None, kept.at):
             return False
@@ -67,6 +72,11 @@ class MemoryRecord:
         """The stored one."""
         self._check()
         return self.stops.get(robot.robot_id)
+
+    async def pending_stops(self) -> list[StopRecord]:
+        """All that are stored."""
+        self._check()
+        return list(self.stops.values())
 
     def _check(self) -> None:
         if self.fails is not None:

@@ -237,7 +237,7 @@ from relay_db.queries.sharing import (
     share_robot,
     unshare_robot,
 )
-from relay_db.queries.stops import order_stop, order_stop_once, pending_stop, pending_stops, remove_stop
+from relay_db.queries.stops import delete_stop, pending_stop, pending_stops, store_stop, store_stop_once
 from relay_db.queries.tokens import (
     TokenKind,
     consume_login,
@@ -352,6 +352,7 @@ __all__ = [
     "create_token",
     "data_matches",
     "delete_events",
+    "delete_stop",
     "enable_pipe",
     "end_role_run",
     "enrolled_robots",
@@ -422,8 +423,6 @@ __all__ = [
     "oldest_events",
     "open_session",
     "open_token_family",
-    "order_stop",
-    "order_stop_once",
     "pending_stop",
     "pending_stops",
     "pipe_accounts",
@@ -459,7 +458,6 @@ __all__ = [
     "remove_robot_group",
     "remove_role",
     "remove_role_run",
-    "remove_stop",
     "remove_user",
     "renew_entry",
     "revision",
@@ -492,6 +490,8 @@ __all__ = [
     "store_module_order",
     "store_module_reports",
     "store_role",
+    "store_stop",
+    "store_stop_once",
     "stored_jobs",
     "surplus_events",
     "token_is_live",

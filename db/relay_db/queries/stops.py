@@ -13,7 +13,7 @@ from relay_protocol.errors import NotFound
 from relay_protocol.limits import REASON_LENGTH, STOP_ID_LENGTH
 
 
-def order_stop(
+def store_stop(
     s: Session,
     robot_id: int,
     by: str,
@@ -44,26 +44,29 @@ def order_stop(
     return order
 
 
-def order_stop_once(s: Session, robot_id: int, by: str, why: str, at: float, stop_id: str) -> bool:
+def store_stop_once(s: Session, robot_id: int, by: str, why: str, at: float, stop_id: str) -> bool:
     """Store an order to stop for a relay that runs, or for the next one that does.
 
     It counts up the revision, so that a running relay sends the order at once. Parameters and errors are those of
-    :func:`order_stop`.
+    :func:`store_stop`.
 
     :returns: false if the order is stored already: the relay has received it by another path
     """
     stored = pending_stop(s, robot_id)
     if stored is not None and stop_id and (stored.by, stored.stop_id) == (by, stop_id):
         return False
-    order_stop(s, robot_id, by, why, at, stop_id, announce=True)
+    store_stop(s, robot_id, by, why, at, stop_id, announce=True)
     return True
 
 
-def remove_stop(s: Session, robot_id: int, at: float | None = None) -> bool:
+def delete_stop(s: Session, robot_id: int, at: float | None = None, *, announce: bool = False) -> bool:
     """Remove an order to stop; false if there was none.
 
     :param at: only the order of this time, Unix seconds; ``None`` for any order
+    :param announce: as of :func:`store_stop`
     """
+    if announce:
+        bump(s)
     order = delete(StopOrder).where(StopOrder.robot_id == robot_id)
     if at is not None:
         order = order.where(StopOrder.at == at)

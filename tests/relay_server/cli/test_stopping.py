@@ -28,7 +28,7 @@ def test_without_a_relay_the_order_is_stored(cli: Any) -> None:
     cli.ok("robot", "add", "rover")
     cli.ok("robot", "add", "mule")
     said = cli.ok("stop", "rover", "--why", "smoke")
-    assert said == "Robot rover cannot be reached now; it will be stopped as soon as it comes back.\n"
+    assert said == "Robot rover will be stopped as soon as it can be reached.\n"
     assert pending(cli) == [(1, os_user(), "smoke")]
     assert cli.json("stop", "--all") == {
         "robots": [{"robot": "mule", "done": False}, {"robot": "rover", "done": False}]
@@ -80,7 +80,7 @@ def test_a_relay_that_runs_is_asked(live: Any, relay: Any) -> None:
     assert result.exit_code == 1
     first, second, third, fourth = result.stdout.splitlines()
     assert first == "Robot a is stopped."
-    assert "b cannot be reached now" in second
+    assert "b will be stopped as soon as it can be reached" in second
     assert third.startswith("Robot c: the database is locked")
     assert fourth == "Robot d is stopped, but …"
     assert "\x1b" not in third
@@ -148,7 +148,7 @@ def test_a_stop_that_the_relay_has_stored_is_not_stored_and_audited_again(
     def store_first(folder: Any, what: str, order: dict[str, Any], *rest: Any) -> dict[str, Any]:
         database = Database(f"sqlite:///{live.data}/switchboard.db")
         with database.begin() as s:
-            queries.order_stop(s, 1, order["by"], order["why"], 5.0, order["stop_id"])
+            queries.store_stop(s, 1, order["by"], order["why"], 5.0, order["stop_id"])
         database.close()
         return send_order(folder, what, order, *rest)
 
@@ -196,5 +196,7 @@ def test_stops_of_robots_the_relay_could_not_look_up_are_stored(live: Any, relay
     result = live("stop", "--all")
     assert result.exit_code == 0, result.output
     assert "Not all robots have the order yet: it did not answer" in result.stderr
-    assert result.stdout.startswith("Robot rover is stopped.\nRobot mule cannot be reached now")
+    assert result.stdout.startswith(
+        "Robot rover is stopped.\nRobot mule will be stopped as soon as it can be reached"
+    )
     assert [robot for robot, *_ in pending(live)] == [2]

@@ -196,6 +196,33 @@ def test_taken_control_is_released_after_many_requests(tmp_path: Path) -> None:
     assert [site.ask("DELETE", f"{HERE}/control", **ANN).status for _ in range(3)] == [204] * 3
 
 
+class UnreachableHome:
+    """The robot is at another relay, which can't be reached."""
+
+    def __init__(self) -> None:
+        self.forwarder = self
+
+    async def relay_of(self, principal: Principal, robot: str, *, from_memory: bool) -> Any:
+        """The other relay."""
+        return self
+
+    async def forward(self, *arguments: Any) -> None:
+        """Fails."""
+        raise Unavailable("the robot's relay can't be reached")
+
+
+def test_only_a_stop_is_taken_for_a_robot_whose_relay_is_unreachable(site: Site) -> None:
+    """It is stored. Control is not released here, as the other relay has it: the caller must know."""
+    site.router._forwarding = cast(Any, UnreachableHome())
+    released = site.ask("DELETE", f"{HERE}/control", **ANN)
+    assert (released.status, released.json["detail"]) == (503, "the robot's relay can't be reached")
+    assert site.console.asked == []
+    site.console.done = False
+    assert site.post("stop").status == 202
+    assert site.post("services/relay/stop").status == 200
+    assert [what for what, *_ in site.console.asked] == ["stop", "stop"]
+
+
 def test_a_stop_reports_whether_it_is_done(site: Site) -> None:
     """The status is 202 for a robot that is offline and stops later."""
     answer = site.post("stop", {"why": "smoke"})

@@ -421,11 +421,11 @@ def test_an_order_of_the_database_that_is_over_is_put_away() -> None:
     result(scene.service.stopping.stop(ANN, "smoke"))
     over = StopRecord(1, "ann", "smoke", scene.wall())
     scene.record.stops[1] = over
-    assert not scene.service.stopping.add_stored(over, 0)
+    assert not scene.service.stopping.add_stored(over, 0, 0)
     assert scene.record.stops == {}
     scene.offline()
     result(scene.service.stopping.stop(ANN, "again"))
-    assert not scene.service.stopping.add_stored(scene.record.stops[1], 0)
+    assert not scene.service.stopping.add_stored(scene.record.stops[1], 0, 0)
     assert list(scene.record.stops) == [1]
 
 
@@ -451,18 +451,18 @@ def test_orders_of_the_database_are_sent_once() -> None:
     scene = ControlWorld().online()
     stopping = scene.service.stopping
     order = StopRecord(1, "root", "maintenance", 1.8e9)
-    assert stopping.add_stored(order, 0)
+    assert stopping.add_stored(order, 0, 0)
     stopping.robot_online()
     assert [each.why for each in scene.link.orders(link.Stop)] == ["maintenance"]
-    assert not stopping.add_stored(order, 0)
-    assert not stopping.add_stored(None, 0)
+    assert not stopping.add_stored(order, 0, 0)
+    assert not stopping.add_stored(None, 0, 0)
     assert scene.service.snapshot.stopped == ("root", "maintenance", order.at, True, None)
 
 
 def test_an_order_of_the_database_and_one_of_the_admin_socket_with_one_id_are_one_stop() -> None:
     scene = ControlWorld().online()
     stopping = scene.service.stopping
-    assert stopping.add_stored(StopRecord(1, "root", "smoke", 5.0, "press-1"), 0)
+    assert stopping.add_stored(StopRecord(1, "root", "smoke", 5.0, "press-1"), 0, 0)
     result(stopping.stop(local_actor("root"), "smoke", "press-1"))
     assert scene.record.stop_events == 0, "the command line has recorded it"
     assert scene.service.snapshot.stopped is not None and scene.service.snapshot.stopped.again is None
@@ -475,9 +475,9 @@ def test_an_order_that_is_given_by_a_clock_that_was_set_back_counts() -> None:
     scene = ControlWorld().online()
     result(scene.service.stopping.stop(ANN, ""))
     result(scene.service.stopping.resume(ANN, "", LATER))
-    assert scene.service.stopping.add_stored(StopRecord(1, "root", "maintenance", 5.0), 0)
+    assert scene.service.stopping.add_stored(StopRecord(1, "root", "maintenance", 5.0), 0, 0)
     assert scene.service.snapshot.stopped is not None
-    assert not scene.service.stopping.add_stored(StopRecord(1, "root", "maintenance", 5.0), 0)
+    assert not scene.service.stopping.add_stored(StopRecord(1, "root", "maintenance", 5.0), 0, 0)
 
 
 def test_a_stop_that_is_not_stored_is_not_reported_as_stored() -> None:
@@ -592,12 +592,73 @@ def test_a_stop_from_the_database_is_known_once_it_was_read() -> None:
     asked = world.now_ns()
     world.clock.advance(1)
     order = StopRecord(1, "root", "maintenance", 5.0)
-    world.controllers.stored_stops_read([order])
+    world.record.stops[1] = order
+    result(world.controllers.read_stored_stops())
     read = world.now_ns()
     world.clock.advance(1)
-    world.controllers.stored_stops_read([order])
+    result(world.controllers.read_stored_stops())
     stopping = world.controllers.of(world.robot).stopping
     with pytest.raises(StoppedSince):
         result(stopping.resume(ANN, "", asked))
     result(stopping.resume(ANN, "", read))
     assert stopping.stopped is None
+
+
+def test_a_stop_that_another_relay_had_confirmed_is_over() -> None:
+    """Its order is stored no longer: it is neither shown nor sent when the robot connects to this relay."""
+    scene = ControlWorld()
+    stopping = scene.service.stopping
+    result(stopping.stop(ANN, "smoke"))
+    scene.clock.advance(1)
+    del scene.record.stops[1]
+    assert not stopping.add_stored(None, scene.now_ns(), scene.now_ns())
+    assert stopping.stopped is None
+    scene.online()
+    assert scene.link.orders(link.Stop) == []
+
+
+def test_an_order_that_was_read_and_is_stored_no_longer_is_over() -> None:
+    """The command line has stored it, and another relay had it confirmed."""
+    scene = ControlWorld()
+    stopping = scene.service.stopping
+    assert stopping.add_stored(StopRecord(1, "root", "smoke", 5.0), scene.now_ns(), scene.now_ns())
+    scene.clock.advance(1)
+    stopping.add_stored(None, scene.now_ns(), scene.now_ns())
+    assert stopping.stopped is None
+
+
+@pytest.mark.parametrize("reason", ["being written", "not written", "read before", "online"])
+def test_a_stop_is_not_over_because_it_is_not_stored_yet(reason: str) -> None:
+    """Only a reading that began after it was stored shows that it is over; and never while its robot is here."""
+    scene = ControlWorld()
+    stopping = scene.service.stopping
+    began = scene.now_ns()
+    scene.clock.advance(1)
+    if reason == "being written":
+        scene.record.hold = True
+    if reason == "not written":
+        scene.record.fails = Unavailable("the disk is full")
+    if reason == "online":
+        scene.online()
+        scene.link.silent = True
+    ordered = outcome(stopping.stop(ANN, "smoke"))
+    scene.clock.advance(1)
+    read_at = began if reason == "read before" else scene.now_ns()
+    stopping.add_stored(None, scene.now_ns(), read_at)
+    assert stopping.stopped is not None, ordered
+    if reason != "online":
+        scene.online()
+    assert scene.link.orders(link.Stop) != []
+
+
+def test_the_end_of_an_order_that_was_read_is_announced() -> None:
+    """So that the relay that has stored it knows. The end of one's own concerns no other relay."""
+    scene = ControlWorld().online()
+    stopping = scene.service.stopping
+    assert stopping.add_stored(StopRecord(1, "root", "smoke", 5.0), 0, 0)
+    scene.record.stops[1] = StopRecord(1, "root", "smoke", 5.0)
+    stopping.send_pending()
+    result(stopping.resume(ANN, "", LATER))
+    result(stopping.stop(ANN, "again"))
+    assert [announced for at, announced in scene.record.deleted if at == 5.0] == [True]
+    assert {announced for at, announced in scene.record.deleted if at != 5.0} == {False}
