@@ -56,6 +56,33 @@ def test_private_names_are_found_by_their_last_word(house: ModuleType) -> None:
     assert found == ["relay_server.a.RealmDesk", "relay_server.a._Wish"]
 
 
+def test_names_and_words_without_a_meaning_are_found(house: ModuleType) -> None:
+    """Names by themselves, words in docstrings and comments only."""
+    write(
+        house,
+        "relay_server/a.py",
+        '"""Told anew."""\n\ndesk = helpdesk = "told"\n\n\ndef f(_helm): ...  # nobody\n',
+    )
+    found = house.names_without_meaning(house.modules())
+    assert found == ["relay_server/a.py:3 desk", "relay_server/a.py:6 _helm"]
+    assert house.unclear_words(house.modules()) == [
+        "relay_server/a.py:1 Told",
+        "relay_server/a.py:1 anew",
+        "relay_server/a.py:6 nobody",
+    ]
+
+
+def test_circles_of_the_portal_are_found(house: ModuleType) -> None:
+    """Types count, files of components, and both forms of addresses."""
+    (house.ROOT / "web_client/src/lib").mkdir(parents=True)
+    write(house, "web_client/src/lib/a.ts", "import type { B } from '$lib/b';\nimport x from 'svelte';\n")
+    write(house, "web_client/src/lib/b.ts", 'import C from "../C.svelte";\n')
+    write(house, "web_client/src/C.svelte", "<script>import { a } from './lib/a';</script>")
+    graph = house.portal_imports()
+    assert graph == {"lib/a.ts": {"lib/b.ts"}, "lib/b.ts": {"C.svelte"}, "C.svelte": {"lib/a.ts"}}
+    assert house._circle_lines(graph) == ["3 files: C.svelte, lib/a.ts, lib/b.ts"]
+
+
 def test_constructors_with_an_unpacked_tuple_are_found(house: ModuleType) -> None:
     write(house, "relay_server/a.py", "x = Service(*parts)\ny = function(*parts)\nz = Service(a, b=1)\n")
     assert house.unpacked_calls(house.modules()) == ["relay_server/a.py:1 Service"]
