@@ -7,8 +7,7 @@ RFC 8259 section 4 leaves open which of two equal keys counts. The relay and a r
 differently, so such text is refused. msgspec and orjson silently take the last one. The parser of the standard library
 reports all pairs, but takes as long as all other work on a small message. So cheap proofs come first:
 
-- A short message is looked up by its shape: its text without the characters of numbers. A stream of commands has one.
-- A short message of a new shape is decoded and encoded again. A lost key is a lost colon.
+- A short message is decoded and encoded again. A lost key is a lost colon.
 - In a long message with few strings the quotation marks are searched.
 
 What none of them proves goes to the parser of the standard library. All of them take linear time.
@@ -208,14 +207,8 @@ encode = msgspec.json.Encoder().encode
 
 # --- keys -------------------------------------------------------------------------------------------------
 
-SHORT_BYTES = 2048
-"""Length up to which a text is looked up by its shape."""
-
-SHAPES = 512
-"""Most shapes that are stored; together they have at most 1 MiB."""
-
-OF_NUMBERS = b"0123456789+-.eE"
-"""Characters that a shape does not have."""
+_SHORT_BYTES = 2048
+"""Length up to which a text is decoded and encoded again."""
 
 _NOT_BRACES = bytes(byte for byte in range(256) if byte not in b"{}")
 _OPENING, _CLOSING = ord("{"), ord("}")
@@ -228,13 +221,6 @@ _SPARSE = 64
 _SHOWN = 40
 """Characters of a key in an error message."""
 
-proved_shapes: set[bytes] = set()
-"""ASCII shapes of texts that passed :func:`check_text` and :func:`check_keys`. Texts of such a shape pass both,
-whatever numbers stand in them."""
-
-_seen_shapes: set[bytes] = set()
-"""Shapes that came once. Proving a shape takes time, which is wasted on a text that never comes again."""
-
 
 def check_keys(data: bytes) -> None:
     """Refuse JSON in which an object has a key twice, also with different escapes.
@@ -242,12 +228,8 @@ def check_keys(data: bytes) -> None:
     :param data: JSON that passed :func:`check_text`; ``NaN`` and ``Infinity`` are let through
     :raises MalformedMessage: the sentence names the key
     """
-    if len(data) <= SHORT_BYTES:
-        shape = data.translate(None, OF_NUMBERS)
-        if shape in proved_shapes:
-            return
+    if len(data) <= _SHORT_BYTES:
         if _survives(data):
-            _learn(shape)
             return
     elif b"\\" not in data and _distinct_by_quotes(data):
         return
@@ -255,26 +237,6 @@ def check_keys(data: bytes) -> None:
         json.loads(str(data, "utf-8"), strict=False, object_pairs_hook=_pairs, parse_int=len, parse_float=len)
     except ValueError as error:
         raise MalformedMessage(f"the message is not JSON: {error}") from None
-
-
-def _learn(shape: bytes) -> None:
-    """Note the shape of a text with distinct keys.
-
-    A key with an escape may equal one without. Keys may differ by a digit alone, which the shape does not show. Other
-    digits can part the bytes of a character.
-    """
-    if b"\\" in shape or not shape.isascii():
-        return
-    if shape not in _seen_shapes:
-        _add(_seen_shapes, shape)
-    elif _distinct_by_quotes(shape):
-        _add(proved_shapes, shape)
-
-
-def _add(shapes: set[bytes], shape: bytes) -> None:
-    if len(shapes) >= SHAPES:
-        shapes.clear()
-    shapes.add(shape)
 
 
 def _survives(data: bytes) -> bool:
@@ -298,11 +260,11 @@ def _distinct_by_quotes(data: bytes) -> bool:
 
     Long strings and long lists of numbers are skipped in C.
 
-    :param data: JSON without a backslash; its numbers may be missing
+    :param data: JSON without a backslash
     """
     keys: set[bytes] = set()
     outer: list[set[bytes]] = []
-    most = max(len(data) // _SPARSE, SHORT_BYTES)
+    most = max(len(data) // _SPARSE, _SHORT_BYTES)
     begun = at = 0
     for _ in range(most):
         start = data.find(b'"', at)

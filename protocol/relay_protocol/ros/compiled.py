@@ -105,7 +105,10 @@ class CompiledTypes:
         return found[checked]
 
     def check(self, name: str) -> Check:
-        """The check of a text for robots that speak JSON; it takes what :meth:`writer` takes."""
+        """The check of a text for robots that speak JSON; it takes what :meth:`writer` takes; returns what they get.
+
+        Of a type without arrays that has all fields of the type. Other texts, and long ones, stay as they are.
+        """
         found = self._checks.get(name)
         if found is None:
             write = self.writer(name, checked=True)
@@ -145,12 +148,12 @@ class CompiledTypes:
 
 
 def json_for_robot(body: bytes) -> bytes:
-    """A text that was checked, as robots that speak JSON get it.
-
-    So numbers keep all their digits, and omitted fields stay omitted.
+    """A text that was checked but for its keys, as robots that speak JSON get it: unchanged.
 
     :raises Invalid: it is too large
+    :raises MalformedMessage: it has a key twice, which the robot could read in another way
     """
+    jsontext.check_keys(body)
     body = nonfinite.marks_to_null(body)
     if len(body) > LARGEST_BODY:
         raise Invalid(f"the message has {len(body)} bytes as JSON; a robot takes at most {LARGEST_BODY}")

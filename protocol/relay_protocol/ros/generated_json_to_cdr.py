@@ -15,6 +15,7 @@ import msgspec
 import pybase64
 from msgspec import UNSET
 
+from relay_protocol import jsontext
 from relay_protocol.limits import RELAY_FRAME
 from relay_protocol.ros.cdr_to_json import HEADER_BYTES
 from relay_protocol.ros.codegen import CodeGenerator, FunctionBuilder, TooLarge, UseSlowPath
@@ -69,7 +70,7 @@ def generate(name: str, definitions: dict[str, Definition]) -> Callable[[Write],
 
 
 def generate_check(name: str, definitions: dict[str, Definition]) -> Callable[[Check], Check] | None:
-    """Generate a check of whether the writer takes a text, in less time than it writes.
+    """Generate a check of whether the writer takes a text. It returns the text with all fields of the type.
 
     :returns: what takes a check by writing, for unusual texts, and returns the whole check; ``None`` for types with
         arrays
@@ -106,8 +107,9 @@ class _CheckGenerator:
         if self._codes:
             pack = source.constant(struct.Struct("<" + "".join(self._codes)).pack)
             source.line(f"{pack}({', '.join(self._numbers)})")
-        # The text has no mark of :mod:`relay_protocol.nonfinite`: a mark is a string with a NUL.
-        source.line("return body")
+        # The message has no mark of :mod:`relay_protocol.nonfinite`: a mark is a string with a NUL. It is encoded
+        # again, so that the robot gets what was checked, also of a text that has a key twice.
+        source.line(f"return {source.constant(jsontext.encode)}(m)")
 
     def _message(self, name: str, value: str) -> None:
         definition = self._definitions[name]

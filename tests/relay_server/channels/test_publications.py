@@ -423,7 +423,7 @@ def test_a_robot_of_json_is_sent_json(world: World) -> None:
     person = world.person()
     world.robot_joins()
     person.says("publish", topic="/chatter", msg={"data": "x"})
-    assert [body for _, _, body in world.link.samples] == [b'{"data": "x"}']
+    assert [body for _, _, body in world.link.samples] == [b'{"data":"x"}']
     assert not world.link.all(link.GetType)
 
 
@@ -563,7 +563,7 @@ def test_a_robot_that_comes_back_speaking_otherwise_is_sent_that(world: World) -
     world.robot_comes(encodings=["json"])
     world.robot_joins()
     person.says("publish", topic="/chatter", msg={"data": "b"})
-    assert [body for _, _, body in world.link.samples] == [b'{"data": "b"}']
+    assert [body for _, _, body in world.link.samples] == [b'{"data":"b"}']
 
 
 def test_advertisements_of_one_client_are_bounded(world: World, monkeypatch: Any) -> None:

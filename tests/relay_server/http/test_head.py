@@ -28,6 +28,12 @@ STREAMS = sorted(
 """Addresses of which a GET can be a stream."""
 
 TOKEN = "administrator"
+ROLE = "Switch-Light-Lamp"
+DOCUMENT = """
+@prefix fierro: <fierro:> .
+fierro:Switch-Light-Lamp a fierro:role ;
+  fierro:subject fierro:Switch ; fierro:action fierro:Light ; fierro:directObject fierro:Lamp .
+"""
 
 
 @pytest_twisted.async_yield_fixture
@@ -51,9 +57,12 @@ async def relay(tmp_path: Path) -> AsyncIterator[Relay]:
 def heads(port: int, paths: list[str]) -> dict[str, int]:
     """Statuses of HEAD, all on one connection: each answer ends before the next request."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    sent = {"Authorization": f"Bearer {TOKEN}", "Content-Type": "text/turtle"}
+    connection.request("PUT", f"/api/v1/roles/{ROLE}", DOCUMENT, sent)
+    assert b'"role"' in connection.getresponse().read()
     found = {}
     for path in paths:
-        address = path.replace("{robot}", "rover").replace("{name:path}", "chatter")
+        address = path.replace("{robot}", "rover").replace("{name:path}", "chatter").replace("{role}", ROLE)
         wanted = {"Authorization": f"Bearer {TOKEN}", "Accept": "text/event-stream"}
         connection.request("HEAD", address, headers=wanted)
         answer = connection.getresponse()
@@ -69,7 +78,7 @@ async def test_head_of_a_stream_ends_and_leaves_nothing(relay: Relay) -> None:
     assert len(STREAMS) > 7
     found = await deferToThread(heads, relay.http_port, STREAMS * 2)
     missing = {each for each, status in found.items() if status == 404}
-    assert missing == {"/api/v1/robots/{robot}/goals/{id}", "/api/v1/roles/{role}/run"}
+    assert missing == {"/api/v1/robots/{robot}/goals/{id}"}
     assert set(found.values()) == {200, 404}
     assert not relay.services.core.access._permits
 
