@@ -5,35 +5,13 @@ A participant of Fast DDS that exists when an address changes never finds nodes 
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable
 from typing import Protocol
 
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-try:
-    import psutil
-except ImportError:  # optional
-    psutil = None
-
-CHECK_SECONDS = 3.0
-"""Seconds between two looks at the addresses. A change counts when two looks agree, and so does standing still."""
-
-
-def own_addresses() -> frozenset[str]:
-    """IPv4 addresses of this machine with their interfaces; empty without psutil.
-
-    Loopback is left out, and IPv6, which DDS does not use by default.
-    """
-    if psutil is None:
-        return frozenset()
-    return frozenset(
-        f"{name} {each.address}"
-        for name, addresses in psutil.net_if_addrs().items()
-        for each in addresses
-        if each.family == socket.AF_INET and not each.address.startswith("127.")
-    )
+from robot_client.addresses import own_addresses
 
 
 class RenewableRobot(Protocol):
@@ -54,7 +32,9 @@ class RenewableRobot(Protocol):
 
 
 class AddressChanges:
-    """Watches the addresses; :meth:`check` is called every :data:`CHECK_SECONDS`.
+    """Watches the addresses; :meth:`check` is called every :data:`robot_client.addresses.CHECK_SECONDS`.
+
+    A change counts when two looks agree, and so does standing still.
 
     :param read: the addresses now
     """

@@ -17,7 +17,8 @@ from twisted.python.threadpool import ThreadPool
 
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Unavailable
-from robot_client.address_changes import CHECK_SECONDS, AddressChanges
+from robot_client.address_changes import AddressChanges
+from robot_client.addresses import CHECK_SECONDS
 from robot_client.camera.ipc import CameraSettings
 from robot_client.camera.service import DaemonCameras
 from robot_client.camera.supervisor import CameraSupervisor

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
@@ -15,9 +16,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
 from relay_protocol.errors import Invalid, Unavailable
+from robot_client.addresses import AddressWatch, own_addresses
 from robot_client.platforms.ros2.errors import check_namespace, in_one_line
 from robot_client.platforms.ros2.executor import make_executor
-from robot_client.platforms.ros2.transport import without_shared_memory
+from robot_client.platforms.ros2.transport import on_this_machine, without_shared_memory
 from robot_client.ros_log import ensure_log_folder
 from robot_client.services.health import Level, ServiceFinding
 
@@ -44,7 +46,8 @@ class Service(Protocol):
 def run(name: str, namespace: str, build: Callable[[Any], Service]) -> None:
     """Run a service until SIGINT or SIGTERM. Prints READY when its topics exist.
 
-    Like the daemon's nodes it uses no shared memory, so that a frozen service blocks no other node.
+    Like the daemon's nodes it uses no shared memory, so that a frozen service blocks no other node. Like them it is
+    made again when the machine's addresses have changed (:mod:`robot_client.address_changes`).
 
     :param name: of the node
     :param namespace: before all its names; empty for none
@@ -53,7 +56,22 @@ def run(name: str, namespace: str, build: Callable[[Any], Service]) -> None:
     :raises Invalid: invalid topic name
     :raises Unavailable: ROS 2 does not start, or the service cannot
     """
-    with _stop_requested() as stop, _node(name, namespace) as (node, executor):
+    with _stop_requested() as stop:
+        _run_node(name, namespace, build, stop, lambda: click.echo("READY"))
+        while not stop:
+            _run_node(name, namespace, build, stop, _warn_of_addresses)
+
+
+def _run_node(
+    name: str,
+    namespace: str,
+    build: Callable[[Any], Service],
+    stop: _StopRequested,
+    ready: Callable[[], object],
+) -> None:
+    """Run a service until it is stopped or the machine has other addresses."""
+    addresses = AddressWatch(frozenset if on_this_machine(os.environ) else own_addresses)
+    with _node(name, namespace) as (node, executor):
         try:
             service = build(node)
         except NameValidationException as error:
@@ -61,10 +79,14 @@ def run(name: str, namespace: str, build: Callable[[Any], Service]) -> None:
         with contextlib.closing(service):
             health = HealthReporter(node, service.finding)
             health.report()
-            click.echo("READY")
-            while not stop:
+            ready()
+            while not stop and not addresses.changed():
                 executor.spin_once(timeout_sec=_SPIN_SECONDS)
                 health.report_if_due()
+
+
+def _warn_of_addresses() -> None:
+    click.echo("The machine's addresses have changed, so the ROS node was made again.", err=True)
 
 
 class HealthReporter:

@@ -6,7 +6,8 @@ import pytest
 from twisted.internet.defer import Deferred, succeed
 from twisted.logger import formatEvent, globalLogPublisher
 
-from robot_client.address_changes import AddressChanges, own_addresses
+from robot_client.address_changes import AddressChanges
+from robot_client.addresses import CHECK_SECONDS, AddressWatch, own_addresses
 
 HOME, AWAY, VPN = "wlan0 10.0.0.5", "wlan0 10.9.0.7", "tun0 10.8.0.2"
 
@@ -109,3 +110,16 @@ def test_change_is_logged_in_words(robot: Robot) -> None:
 
 def test_own_addresses_have_no_loopback() -> None:
     assert not [each for each in own_addresses() if " 127." in each]
+
+
+def test_a_watch_needs_two_looks_that_agree() -> None:
+    """It looks rarely. No address at all is no other address: the network comes back."""
+    now, there = 0.0, {HOME}
+    watch = AddressWatch(lambda: frozenset(there), lambda: now)
+    found = []
+    for each in ({HOME}, {AWAY}, {VPN}, set(), set(), {AWAY}, {AWAY}, {AWAY}):
+        there = each
+        assert not watch.changed()
+        now += CHECK_SECONDS
+        found.append(watch.changed())
+    assert found == [False] * 6 + [True] * 2
