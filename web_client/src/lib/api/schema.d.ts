@@ -1683,7 +1683,7 @@ export interface paths {
         get: {
             parameters: {
                 query?: {
-                    /** @description seconds to wait for one; 2 by default */
+                    /** @description seconds to wait for one, 2 by default; with `If-None-Match` for another one than the client has, and 0 answers at once */
                     wait?: number;
                     /** @description largest age in seconds */
                     max_age?: number;
