@@ -373,11 +373,24 @@ class StopController:
             self._forget_requests()
         # The command line has stored it if no relay answered. It may have arrived here all the same, or still arrive.
         if self._ids.is_duplicate(local_actor(stop.by), stop.stop_id):
+            if self._is_confirmed:
+                self._writer.delete(stop)
+                return False
             self._duplicate_at = stop.at
         self._last_stopped_at = max(self._last_stopped_at, seen)
         self._pending, self._stored_since = stop, seen
         self._changed()
         return True
+
+    @property
+    def _is_confirmed(self) -> bool:
+        """Whether the robot is online, and has confirmed all its stops."""
+        robot = self._robot
+        return (
+            robot.control_link is not None
+            and robot.motion_state.stopped is not None
+            and self._pending is None
+        )
 
     def _check_ended_elsewhere(self, read_at: int) -> None:
         """Forget a pending stop that is stored no longer: the relay with the robot had it confirmed, or withdrawn.

@@ -470,6 +470,23 @@ def test_an_order_of_the_database_and_one_of_the_admin_socket_with_one_id_are_on
     assert scene.record.stop_events == 1, "ids are separate for each user"
 
 
+def test_an_order_that_is_stored_after_the_robot_has_confirmed_it_is_not_sent_again() -> None:
+    """The command line stores its order for all robots if one of them takes long. The time of the stop stays."""
+    scene = ControlWorld().online()
+    stopping = scene.service.stopping
+    result(stopping.stop(local_actor("root"), "smoke", "press-1"))
+    before = stopping.stopped
+    scene.clock.advance(6)
+    order = StopRecord(1, "root", "smoke", scene.wall(), "press-1")
+    scene.record.stops[1] = order
+    assert not stopping.add_stored(order, scene.now_ns(), scene.now_ns())
+    assert len(scene.link.orders(link.Stop)) == 1
+    assert (scene.record.stops, stopping.stopped) == ({}, before)
+    result(stopping.resume(ANN, "", LATER))
+    later = StopRecord(1, "root", "smoke", scene.wall() + 1, "press-2")
+    assert stopping.add_stored(later, scene.now_ns(), scene.now_ns())
+
+
 def test_an_order_that_is_given_by_a_clock_that_was_set_back_counts() -> None:
     """Times identify orders and do not sort them."""
     scene = ControlWorld().online()
