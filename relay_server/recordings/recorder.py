@@ -375,12 +375,22 @@ class Recorder:
     def deliver(self, subscription: ClientSubscription, sample: Sample) -> None:
         """A sample of a topic, as it comes."""
         topic, stamp = subscription.topic, sample.ros_time_ns
-        # Samples of several publishers that latch may come in any order; a simulation's jumps are known.
-        if not self._simulated and 0 < stamp < STAMPS_END and not self._channel.subscriptions.latched(topic):
-            jump = self._jumps.seconds(topic, stamp)
-            if jump:
-                self._note_jump("the robot's clock", "back" if jump < 0 else "forward", abs(jump))
-        self.keep(subscription.topic, sample, sample.ros_time_ns)
+        # Samples of several publishers that latch may come in any order.
+        if not self._channel.subscriptions.latched(topic):
+            self._check_clock(topic, stamp)
+        self.keep(topic, sample, stamp)
+
+    def _check_clock(self, name: str, stamp: int) -> None:
+        """Note a jump of the robot's clock; those of a simulation are known.
+
+        :param name: of a topic or a camera, whose stamps grow
+        :param stamp: nanoseconds
+        """
+        if self._simulated or not 0 < stamp < STAMPS_END:
+            return
+        jump = self._jumps.seconds(name, stamp)
+        if jump:
+            self._note_jump("the robot's clock", "back" if jump < 0 else "forward", abs(jump))
 
     def _time_jumped(self) -> None:
         self._note_jump("the robot's simulated time", "back")
@@ -433,6 +443,7 @@ class Recorder:
         if not self._clock_known():
             self._lost += 1
             return
+        self._check_clock(camera, round(frame.stamp * 1e9))
         # A robot with simulated time has no other time for its frames either.
         stamp = self.now_ns if self._simulated else self._valid_stamp(camera, round(frame.stamp * 1e9))
 

@@ -472,6 +472,21 @@ def test_a_clock_that_jumps_is_a_problem(world: World) -> None:
     assert len(scene.memory_writer.written) == 7
 
 
+def test_a_clock_that_jumps_is_seen_by_a_camera_alone(world: World) -> None:
+    """The stamps of its frames are of the robot's clock."""
+    video.robot_comes(world)
+    scene = RecorderWorld(world, (), (CAMERA,))
+    scene.starts()
+    video.robot_joins(world)
+    (stream,) = world.videos.streams_of(world.robot)
+    for number, stamp in enumerate((100, 101, 40, 41), 1):
+        world.clock.advance(1)
+        stream.frame_received(VideoFrame(number, stamp * 10**9, jpeg()))
+    assert [each.partition(";")[0] for each in scene.entry.problems] == [
+        "the robot's clock jumped back by 61 s"
+    ]
+
+
 def test_simulated_time_that_jumps_back_is_a_problem(world: World) -> None:
     """A jump after the end changes nothing."""
     listeners = world.channel.robot_clock.on_jump
