@@ -15,6 +15,9 @@ FUNCTION_FRAME = FUNCTION_BYTES + 16 * KIB
 MAX_WAIT = 60.0
 """Longest time for which the relay waits with the answer about a job, seconds."""
 
+MAX_DEADLINE = 86_400.0
+"""Longest deadline of a call, seconds."""
+
 JobId = Annotated[str, Meta(max_length=32)]
 
 
@@ -31,7 +34,7 @@ class CallFunction(msgspec.Struct, frozen=True, kw_only=True, tag="call", tag_fi
     function: Annotated[str, Meta(max_length=NAME)]
     arguments: bytes
     version: int | None = None
-    deadline: Annotated[float, Meta(gt=0, le=86_400)] | None = None
+    deadline: Annotated[float, Meta(gt=0, le=MAX_DEADLINE)] | None = None
     keep: bool = False
     key: Annotated[str, Meta(max_length=NAME)] = ""
 

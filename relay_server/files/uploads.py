@@ -149,6 +149,8 @@ class Uploads:
             return await self._database.write(queries.add_file, robot_id, new, self._quotas, self._wall())
         except queries.FileQuotaExceeded as error:
             raise UploadRefused("quota", str(error)) from None
+        except Invalid as error:
+            raise UploadRefused("mismatch", str(error), SOON_SECONDS) from None
         except (NotFound, Unavailable) as error:
             raise UploadRefused("unavailable", str(error), SOON_SECONDS) from None
 
@@ -273,6 +275,10 @@ class Upload:
         """
         incoming = self._begin()
         try:
+            if incoming.received + len(data) > self.file.size:
+                raise UploadRefused(
+                    "mismatch", f"more came than the {self.file.size} bytes that were offered"
+                )
             await self._uploads.on_disk(incoming.write, data)
         except BaseException:
             self._cancelled = True

@@ -257,6 +257,7 @@ class FoxgloveParameters:
     ) -> None:
         """:raises SwitchboardError: the node refuses, with the reason"""
         client = self._context.client
+        client.require(Operation.CALL, f"{node}/set_parameters")
         request: list[dict[str, Any]] = [
             {"name": name, "value": await self._parameter_value(node, name, entry)} for name, entry in wanted
         ]
@@ -394,6 +395,8 @@ def _values_in(node: str, names: Sequence[str], answer: Any) -> dict[str, Parame
 
 
 def _bytes_of(value: Any) -> list[int]:
+    if isinstance(value, str) and len(value) > 2 * params.MAX_VALUES:
+        raise Invalid(f"a byte_array may have {params.MAX_VALUES} bytes")
     try:
         return list(base64.b64decode(value, validate=True))
     except (TypeError, ValueError, binascii.Error):

@@ -261,6 +261,17 @@ class DaskEngine:
             )
             self._on_change()
 
+    def _unusable(self, error: Exception) -> None:
+        """Log why a scheduler that answers can't be used."""
+        self.log.error(
+            "the scheduler at {address} can't be used: {kind}: {error}. It needs the same packages as the workers "
+            "('switchboard worker')",
+            address=self._address,
+            kind=type(error).__name__,
+            error=str(error),
+            limited="the scheduler can't be used",
+        )
+
     def _progressed(self, id: str, done: float, text: str) -> None:
         known = self._runs.get(id)
         if known is not None:
@@ -272,8 +283,12 @@ class DaskEngine:
         """Be connected, and connect again."""
         self._serving = asyncio.current_task()
         while True:
-            with suppress(OSError, asyncio.TimeoutError):
+            try:
                 await self._serve_once()
+            except (OSError, asyncio.TimeoutError):
+                pass
+            except Exception as error:
+                self._reactor.callFromThread(self._unusable, error)
             self._reactor.callFromThread(self._found, False, {})
             await asyncio.sleep(RETRY_SECONDS)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Coroutine
+from contextlib import suppress
 from functools import partial
 from statistics import median
 from typing import Any
@@ -18,7 +19,7 @@ from relay_protocol.functions import ATTEMPTS, FunctionDescription, no_function
 from relay_protocol.limits import FUNCTION_BYTES, MIB
 from relay_protocol.rights import Operation
 from relay_server.access import Access, Principal
-from relay_server.common.clock import Clock, PeriodicTimer, PeriodicTimers, as_twisted, cancel
+from relay_server.common.clock import Clock, PeriodicTimer, PeriodicTimers, Timer, as_twisted, cancel
 from relay_server.common.concurrency import SingleFlight, detached, shield
 from relay_server.common.database import AsyncDatabase
 from relay_server.offload.engine import Engine, EngineCall
@@ -37,6 +38,7 @@ from relay_server.offload.schemas import (
 MAX_OF_OWNER = 64
 MAX_JOBS = 1024
 MAX_WAITING_BYTES = 256 * MIB
+MAX_BYTES_OF_OWNER = 64 * MIB
 """Most jobs of one owner, and of all, that wait or run; and most bytes of all arguments."""
 
 DEADLINE_SECONDS = 60.0
@@ -111,7 +113,7 @@ class FunctionService:
         """Jobs that are being stored before they are queued."""
         self._recent: deque[tuple[JobOwner, JobStatus]] = deque(maxlen=RECENT)
         self._queue = JobQueue()
-        self._postponed: list[FunctionJobRecord] = []
+        self._postponed: dict[str, tuple[FunctionJobRecord, Timer]] = {}
         """Jobs of the database that go on once a worker answers."""
         self._starting = 0
         """Jobs that are being marked as running in the database."""
@@ -149,7 +151,7 @@ class FunctionService:
         try:
             function = await self.function(record.function, record.version)
         except Unavailable:
-            self._postponed.append(record)
+            self._postpone(record)
             return
         except SwitchboardError as error:
             words = str(error)
@@ -165,18 +167,34 @@ class FunctionService:
             )
         await self._store.end(record.id, self._end_now(Outcome(code="lost", error=words)))
 
+    def _postpone(self, record: FunctionJobRecord) -> None:
+        """Go on with a job when workers come, or look again after a time. At its deadline it fails."""
+        left = record.deadline - self._wall()
+        if left > 0:
+            timer = self._clock.callLater(min(left, DESCRIBE_SECONDS), self._go_on_postponed, record.id)
+            self._postponed[record.id] = (record, timer)
+            return
+        words = f"function {record.function} has no result at the deadline of the call: no worker answered"
+        self._background(self._store.end(record.id, self._end_now(Outcome(code="deadline", error=words))))
+
+    def _go_on_postponed(self, job_id: str) -> None:
+        record, timer = self._postponed.pop(job_id)
+        cancel(timer)
+        self._background(self._go_on(record))
+
     def _workers_changed(self) -> None:
         """Workers have come or gone: their functions are asked for again, and calls that waited for them begin."""
         self._described_at = None
-        postponed, self._postponed = self._postponed, []
-        for record in postponed:
-            self._background(self._go_on(record))
+        for job_id in list(self._postponed):
+            self._go_on_postponed(job_id)
         self._dispatch()
 
     async def stop(self) -> None:
         """End all calls. Those without a stored result fail."""
         self._closed = True
         self._purging.stop()
+        for _, timer in self._postponed.values():
+            cancel(timer)
         for job in list(self._jobs.values()):
             cancel(job.timer)
             if job.stored:
@@ -222,7 +240,15 @@ class FunctionService:
 
     async def _refresh(self) -> None:
         known = self._described_at
-        if known is None or self._clock.seconds() - known > DESCRIBE_SECONDS:
+        if known is None:
+            await self._describing.run()
+        elif self._clock.seconds() - known > DESCRIBE_SECONDS:
+            # Not awaited: the workers answer when a process is free, which may take as long as the longest call.
+            self._described_at = self._clock.seconds()
+            self._background(self._describe_again())
+
+    async def _describe_again(self) -> None:
+        with suppress(Unavailable):
             await self._describing.run()
 
     async def _describe(self) -> None:
@@ -379,6 +405,12 @@ class FunctionService:
         if mine >= MAX_OF_OWNER:
             raise TooManyJobs(
                 f"{mine} calls of {job.payer} wait or run, the most there may be; wait until one has ended"
+            )
+        mine = sum(len(each.arguments) for each in jobs if each.payer == job.payer)
+        if mine + len(job.arguments) > MAX_BYTES_OF_OWNER:
+            raise TooManyJobs(
+                f"the arguments of the calls of {job.payer} that wait or run have {mine} bytes, and may have "
+                f"{MAX_BYTES_OF_OWNER}; wait until one has ended"
             )
         waiting = sum(len(each.arguments) for each in jobs)
         if len(jobs) >= MAX_JOBS or waiting + len(job.arguments) > MAX_WAITING_BYTES:

@@ -46,6 +46,9 @@ _FIELDS = {
     DOUBLES: "double_array_value",
     STRINGS: "string_array_value",
 }
+MAX_VALUES = 65_536
+"""Most values of a parameter that is a list; each is looked at several times."""
+
 _OF_ELEMENTS = {BOOL: BOOLS, INTEGER: INTEGERS, DOUBLE: DOUBLES, STRING: STRINGS}
 
 
@@ -60,12 +63,21 @@ def from_parameter(parameter: Any) -> tuple[Any] | None:
         if kind == NOT_SET:
             return None
         value = parameter[_FIELDS[kind]]
+        if kind != STRING and _count_of(value) > MAX_VALUES:
+            raise Invalid(f"this parameter has more than {MAX_VALUES} values, which the relay does not show")
         if kind == BYTES and isinstance(value, str):
             # In messages bytes are base64; a parameter's value is what people read and write.
             return (list(base64.b64decode(value, validate=True)),)
     except (TypeError, KeyError, binascii.Error, ValueError):
         raise Invalid("this is no value of a parameter") from None
     return (value,)
+
+
+def _count_of(value: Any) -> int:
+    """Values of a list, or of the base64 of bytes; 0 for others."""
+    if isinstance(value, list):
+        return len(value)
+    return len(value) * 3 // 4 - value[-2:].count("=") if isinstance(value, str) else 0
 
 
 def to_parameter(value: Any, current_type: int | None = None) -> dict[str, Any]:
@@ -77,6 +89,8 @@ def to_parameter(value: Any, current_type: int | None = None) -> dict[str, Any]:
     :raises Invalid: no parameter can have this value
     """
     if isinstance(value, list):
+        if len(value) > MAX_VALUES:
+            raise Invalid(f"a parameter may have {MAX_VALUES} values, not {len(value)}")
         if current_type == DOUBLES or any(isinstance(each, float) for each in value):
             value = [math.nan if each is None else each for each in value]
         kind = _kind_of_list(value, current_type)

@@ -100,6 +100,11 @@ class NavigatorNode:
         values = {"distance_m": f"{progress.distance_left:.2f}", "recoveries": str(progress.recoveries)}
         return ServiceFinding(Level.OK, f"navigating: {self._navigator.state.value}", values)
 
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is under way."""
+        return self._goal is not None
+
     def close(self) -> None:
         """Stand still before the process ends."""
         if self._goal is not None:

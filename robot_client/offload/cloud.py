@@ -11,8 +11,9 @@ from typing import Any
 
 import msgspec
 
-from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from relay_protocol.function_link import (
+    MAX_DEADLINE,
     MAX_WAIT,
     CallFunction,
     CancelFunction,
@@ -20,7 +21,7 @@ from relay_protocol.function_link import (
     FunctionReply,
 )
 from relay_protocol.functions import CallFailed, decode_value, encode_value
-from relay_protocol.limits import FUNCTION_BYTES
+from relay_protocol.limits import FUNCTION_BYTES, NAME
 from robot_client.link.enrolment import StateFolder
 from robot_client.offload.device import state_folder
 from robot_client.offload.function_link import FunctionConnection, Reply
@@ -63,14 +64,25 @@ class Cloud:
         :param newest: while a call of this function is under way, the next one waits, and gives way to a newer one.
             So a slow uplink carries the newest frame
         :raises CallFailed: there is no result; the code says why. After ``lost`` and ``timeout`` it may have run
-        :raises Unavailable: the relay or its workers can't be reached; it did not run
+        :raises Unavailable: the relay or its workers can't be reached, or the call could not be sent in time; it did
+            not run
+        :raises Invalid: the timeout is out of range
         """
+        _check_seconds("timeout", timeout)
         request = CallFunction(
             function=function, arguments=_encode(arguments), version=version, deadline=timeout
         )
         began = time.monotonic()
-        reply = self._begin(request, newest=function if newest else "")
-        return result_of(_wait(reply.future, timeout - (time.monotonic() - began), function))
+        connection = self._connected()
+        reply = connection.begin(msgspec.msgpack.encode(request), function if newest else "")
+        try:
+            return result_of(_wait(reply.future, timeout - (time.monotonic() - began), function))
+        except CallFailed as error:
+            if error.code != "timeout" or not connection.withdraw(reply):
+                raise
+        raise Unavailable(
+            f"the call of function {function} could not be sent in {timeout:g} s: the link is too slow"
+        )
 
     def submit(
         self,
@@ -87,7 +99,12 @@ class Cloud:
         :param deadline: seconds until which it must have ended; an hour by default
         :param key: a repeated submit with this key runs once
         :raises Unavailable: the relay can't be reached
+        :raises Invalid: the deadline is out of range, or the key is too long
         """
+        if deadline is not None:
+            _check_seconds("deadline", deadline)
+        if len(key) > NAME:
+            raise Invalid(f"the key has {len(key)} characters; at most {NAME} are taken")
         request = CallFunction(
             function=function,
             arguments=_encode(arguments),
@@ -119,8 +136,8 @@ class Cloud:
                 self._connection.close("the program has closed the link")
             self._connection = None
 
-    def _begin(self, request: CallFunction | CancelFunction | FetchResult, newest: str = "") -> Reply:
-        return self._connected().begin(msgspec.msgpack.encode(request), newest)
+    def _begin(self, request: CallFunction | CancelFunction | FetchResult) -> Reply:
+        return self._connected().begin(msgspec.msgpack.encode(request))
 
     def _connected(self) -> FunctionConnection:
         with self._lock:
@@ -166,7 +183,7 @@ class Handle:
         :raises CallFailed: no answer
         :raises Unavailable: the relay can't be reached
         """
-        wait = min(wait, MAX_WAIT)
+        wait = min(max(0.0, wait), MAX_WAIT)
         return self._cloud.ask(FetchResult(job=self.id(), wait=wait), wait + CALL_SECONDS)
 
     @property
@@ -182,11 +199,24 @@ class Handle:
         """
         end = time.monotonic() + timeout
         while True:
-            reply = self.status(max(0.0, end - time.monotonic()))
+            try:
+                reply = self.status(max(0.0, end - time.monotonic()))
+            except SwitchboardError as error:
+                # The job goes on if only the question was lost; then it is asked again.
+                if not self._may_ask_again(error) or time.monotonic() + RETRY_SECONDS >= end:
+                    raise
+                time.sleep(RETRY_SECONDS)
+                continue
             if reply.state in DONE:
                 return result_of(reply)
             if time.monotonic() >= end:
                 raise CallFailed("timeout", f"the job has no result after {timeout:g} s; it goes on")
+
+    def _may_ask_again(self, error: SwitchboardError) -> bool:
+        begun = self._begun.done() and self._begun.exception() is None
+        return begun and (
+            isinstance(error, Unavailable) or (isinstance(error, CallFailed) and error.code == "lost")
+        )
 
     def cancel(self) -> None:
         """End the job, or remove its result."""
@@ -204,6 +234,11 @@ def result_of(reply: FunctionReply) -> Any:
     if reply.value is None:
         raise CallFailed(reply.code or reply.state, reply.error or f"the call has ended as {reply.state}")
     return decode_value(reply.value)
+
+
+def _check_seconds(name: str, seconds: float) -> None:
+    if not 0 < seconds <= MAX_DEADLINE:
+        raise Invalid(f"'{name}' must be more than 0 and at most {MAX_DEADLINE:g} s, not {seconds:g}")
 
 
 def _encode(arguments: dict[str, Any]) -> bytes:

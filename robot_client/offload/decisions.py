@@ -7,6 +7,7 @@ import inspect
 import time
 from collections import deque
 from collections.abc import Callable
+from types import MethodType
 from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar
 
 from relay_protocol.errors import SwitchboardError, Unavailable
@@ -97,6 +98,10 @@ class Offloaded(Generic[P, R]):
         self._here_until = -pause
         self.latest: Decision | None = None
 
+    def __get__(self, instance: object, owner: type | None = None) -> Any:
+        """As of a function: a decorated method has its object as first argument, which is not sent."""
+        return self if instance is None else MethodType(self, instance)
+
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         where, why = self._decide()
         began = time.monotonic()
@@ -133,7 +138,9 @@ class Offloaded(Generic[P, R]):
         return {} if self.latest is None else {"runs": self.latest.where, "because": self.latest.why}
 
     def _same_arguments(self, *args: P.args, **kwargs: P.kwargs) -> dict[str, Any]:
-        return inspect.signature(self._local).bind(*args, **kwargs).arguments
+        arguments = inspect.signature(self._local).bind(*args, **kwargs).arguments
+        arguments.pop("self", None)
+        return arguments
 
     def _decide(self) -> tuple[str, str]:
         if self.where != "auto":

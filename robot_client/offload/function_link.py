@@ -8,6 +8,7 @@ import selectors
 import socket
 import ssl
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -19,6 +20,7 @@ from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, PeerError, SwitchboardError, Unavailable
 from relay_protocol.function_link import FUNCTION_FRAME, FunctionReply, decode_reply
 from relay_protocol.functions import FAULTS, CallFailed
+from relay_protocol.limits import MIB
 from robot_client.link.addresses import RelayAddresses
 from robot_client.link.enrolment import Enrolment
 from robot_client.link.links import ControlLink, Event, Identity, LinkEnded, LinkState, SampleReceived
@@ -31,8 +33,11 @@ RECEIVE_BYTES = 256 * 1024
 
 WRITE_BYTES = 64 * 1024
 
-IDLE_SECONDS = 1.0
-"""Seconds without anything after which it is checked whether the relay is silent."""
+CHECK_SECONDS = 1.0
+"""Seconds between two checks whether the relay is silent."""
+
+WAITING_BYTES = 64 * MIB
+"""Most bytes of requests that wait until the link has room."""
 
 
 class FunctionLink(ControlLink):
@@ -98,6 +103,7 @@ class FunctionConnection:
         self._replies: dict[int, Reply] = {}
         self._out: deque[memoryview] = deque()
         self._reason = "the relay closed the connection"
+        self._check_at = 0.0
         self.open = True
         self._socket = _dial(enrolment)
         try:
@@ -120,7 +126,7 @@ class FunctionConnection:
         :param body: MessagePack
         :param newest: of requests of the same text one is under way; of those that wait for its answer only
             the newest is sent
-        :raises Unavailable: the link is lost
+        :raises Unavailable: the link is lost, or too much waits for it
         """
         reply = Reply(next(self._numbers), body, newest)
         with self._lock:
@@ -130,12 +136,24 @@ class FunctionConnection:
             for each in overtaken:
                 self._waiting.remove(each)
                 del self._replies[each.number]
+            waiting = sum(len(each.body) for each in self._waiting)
+            if waiting and waiting + len(body) > WAITING_BYTES:
+                raise Unavailable(f"{waiting} bytes of calls wait for the slow link to the relay already")
             self._waiting.append(reply)
             self._replies[reply.number] = reply
         for each in overtaken:
             each.fail(Overtaken("a newer call took its place while an earlier one was under way"))
         self._wake_up()
         return reply
+
+    def withdraw(self, reply: Reply) -> bool:
+        """Take a request back; false if it was sent, or has its answer."""
+        with self._lock:
+            if reply not in self._waiting:
+                return False
+            self._waiting.remove(reply)
+            self._replies.pop(reply.number, None)
+        return True
 
     def close(self, reason: str) -> None:
         """End the link; calls without an answer fail."""
@@ -195,7 +213,10 @@ class FunctionConnection:
         self._fill()
         wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._out else 0)
         selector.modify(self._socket, wanted)
-        if not selector.select(IDLE_SECONDS):
+        selector.select(CHECK_SECONDS)
+        now = time.monotonic()
+        if now >= self._check_at:
+            self._check_at = now + CHECK_SECONDS
             self._link.check_silence()
         with suppress(BlockingIOError):
             self._woken.recv(4096)

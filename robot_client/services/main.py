@@ -532,7 +532,12 @@ def navigator(
     topics = NavigatorTopics(scan, depth, info, map_topic, base_frame, shortest_depth)
     limits = DriveLimits(max_speed, max_turn)
     settings = NavigatorSettings(topics.sensors(), radius, inflation, limits, localiser_timeout)
-    run("navigator", namespace, lambda node: NavigatorNode(node, topics, settings))
+    run(
+        "navigator",
+        namespace,
+        lambda node: NavigatorNode(node, topics, settings),
+        is_busy=lambda navigator: navigator.busy,
+    )
 
 
 if __name__ == "__main__":

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import click
 import rclpy
@@ -16,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
 from relay_protocol.errors import Invalid, Unavailable
-from robot_client.addresses import AddressWatch, own_addresses
+from robot_client.addresses import CHECK_SECONDS, AddressWatch, own_addresses
 from robot_client.platforms.ros2.errors import check_namespace, in_one_line
 from robot_client.platforms.ros2.executor import make_executor
 from robot_client.platforms.ros2.transport import on_this_machine, without_shared_memory
@@ -43,29 +44,42 @@ class Service(Protocol):
         """Release resources other than the node."""
 
 
-def run(name: str, namespace: str, build: Callable[[Any], Service]) -> None:
+S = TypeVar("S", bound=Service)
+
+
+def _never(service: Service) -> bool:
+    return False
+
+
+def run(name: str, namespace: str, build: Callable[[Any], S], is_busy: Callable[[S], bool] = _never) -> None:
     """Run a service until SIGINT or SIGTERM. Prints READY when its topics exist.
 
     Like the daemon's nodes it uses no shared memory, so that a frozen service blocks no other node. Like them it is
-    made again when the machine's addresses have changed (:mod:`robot_client.address_changes`).
+    made again when the machine's addresses have changed (:mod:`robot_client.address_changes`), once it is not busy.
 
     :param name: of the node
     :param namespace: before all its names; empty for none
     :param build: creates the service
+    :param is_busy: whether it would lose something if it were made again now
     :raises click.BadParameter: invalid namespace
     :raises Invalid: invalid topic name
     :raises Unavailable: ROS 2 does not start, or the service cannot
     """
     with _stop_requested() as stop:
-        _run_node(name, namespace, build, stop, lambda: click.echo("READY"))
+        _run_node(name, namespace, build, is_busy, stop, lambda: click.echo("READY"))
         while not stop:
-            _run_node(name, namespace, build, stop, _warn_of_addresses)
+            try:
+                _run_node(name, namespace, build, is_busy, stop, _note_addresses)
+            except Unavailable as error:
+                click.echo(f"{error}; it is tried again", err=True)
+                time.sleep(CHECK_SECONDS)
 
 
 def _run_node(
     name: str,
     namespace: str,
-    build: Callable[[Any], Service],
+    build: Callable[[Any], S],
+    is_busy: Callable[[S], bool],
     stop: _StopRequested,
     ready: Callable[[], object],
 ) -> None:
@@ -80,12 +94,12 @@ def _run_node(
             health = HealthReporter(node, service.finding)
             health.report()
             ready()
-            while not stop and not addresses.changed():
+            while not stop and (is_busy(service) or not addresses.changed()):
                 executor.spin_once(timeout_sec=_SPIN_SECONDS)
                 health.report_if_due()
 
 
-def _warn_of_addresses() -> None:
+def _note_addresses() -> None:
     click.echo("The machine's addresses have changed, so the ROS node was made again.", err=True)
 
 

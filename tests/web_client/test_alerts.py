@@ -335,9 +335,12 @@ class TestOrders:
         expect(toast).to_contain_text("It is unknown whether all robots are stopped.")
         expect(toast).to_have_attribute("role", "alert")
 
-    def test_a_stop_can_not_be_cancelled(self, open_page: OpenPage) -> None:
-        """During the stop there is no cancel button, and leaving the page does not cancel it."""
+    def test_a_stop_can_not_be_cancelled(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """During the stop there is no cancel button, and leaving the page does not cancel it. Without an answer it
+        is said not to be confirmed.
+        """
         page = open_page("/fleet", user="admin")
+        relay.do(stuck=["pages"])
         ended: list[str] = []
         page.on("requestfailed", lambda request: ended.append(request.url))
         held: list[Route] = []
@@ -345,13 +348,28 @@ class TestOrders:
         seen(page, "fleet-order").click()
         seen(page, "order-pattern").fill("rover-1")
         seen(page, "order-send").click()
-        expect(page.get_by_text("Stopping. It continues when you leave the page.")).to_be_visible()
+        expect(seen(page, "order-unconfirmed")).to_contain_text("Not confirmed: no robot has answered yet.")
         expect(page.get_by_role("button", name="Cancel")).to_have_count(0)
         seen(page, "alerts-link").click()
         expect(seen(page, "alerts-empty")).to_be_visible()
         with page.expect_response("**/api/v1/fleet"):
             held[0].fulfill(status=200, body="")
         assert ended == []
+
+    def test_a_stop_passes_when_all_requests_are_stuck(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Of a pattern, too: by websockets, of which the one of the updates is open already."""
+        page = open_page("/fleet", user="admin")
+        page.route("**/api/v1/fleet", lambda route: None)
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill("rover-*")
+        seen(page, "order-why").fill("wet floor")
+        seen(page, "order-send").click()
+        expect(seen(page, "order-progress")).to_have_text("2 of 2 robots, done")
+        asked = relay.log(op="page")
+        assert [(each["robots"], each["do"], each["why"]) for each in asked] == [
+            (["rover-*"], "stop", "wet floor")
+        ] * 2
+        assert len({each["stop_id"] for each in asked}) == 1
 
     def test_a_long_order_fits_a_phone(self, open_page: OpenPage) -> None:
         """For any number of robots the button is not wider than the window."""

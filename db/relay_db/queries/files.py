@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from relay_db.models import FileUsage, Robot, StoredFile
 from relay_db.queries.records import FileRecord, FileUsageRecord, fetch_all, fetch_one
-from relay_protocol.errors import NotFound, Refused
+from relay_protocol.errors import Invalid, NotFound, Refused
 
 MIN_CHARGED_BYTES = 4096
 """Bytes that count for a file at least, so that the number of small files is bounded too."""
@@ -68,6 +68,7 @@ def add_file(s: Session, robot_id: int, new: NewFile, quotas: FileQuotas, now: f
 
     :raises NotFound: the robot was removed
     :raises FileQuotaExceeded: a quota is used up; names it
+    :raises Invalid: the file that exists has another size
     """
     realm_id = s.scalar(select(Robot.realm_id).where(Robot.id == robot_id))
     if realm_id is None:
@@ -76,6 +77,8 @@ def add_file(s: Session, robot_id: int, new: NewFile, quotas: FileQuotas, now: f
     same = and_(StoredFile.robot_id == robot_id, StoredFile.name == new.name, StoredFile.sha256 == new.sha256)
     found = fetch_one(s, FileRecord, select(*_COLUMNS).where(same))
     if found is not None:
+        if found.size != new.size:
+            raise Invalid(f"the file of this name and SHA-256 has {found.size} bytes, not {new.size}")
         touch_file(s, found.id, now)
         return found
     _check_quotas(s, realm_id, usage, charged_bytes(new.size), quotas)

@@ -508,6 +508,17 @@ def test_a_viewer_without_the_right_to_call_sets_nothing(tuned: FoxgloveWorld) -
     assert any("set parameters of /base" in each for each in viewer.statuses())
 
 
+def test_a_long_array_of_bytes_is_refused_before_it_is_decoded(tuned: FoxgloveWorld) -> None:
+    """A viewer is refused before that, whatever the value."""
+    owner, viewer = tuned.client(), tuned.client(Level.VIEWER)
+    tuned.robot_joins()
+    entry = {"name": "/base.speed", "type": "byte_array", "value": "!" * 2_000_000}
+    for client, words in ((owner, "may have 65536 bytes"), (viewer, "call")):
+        client.sends("setParameters", parameters=[entry])
+        assert any(words in each for each in client.statuses())
+    assert not [each for each in tuned.link.all(link.CallService) if each.service == "/base/set_parameters"]
+
+
 def test_values_that_were_read_are_not_sent_when_the_right_to_read_them_is_gone(tuned: FoxgloveWorld) -> None:
     client = tuned.client()
     tuned.robot_joins()

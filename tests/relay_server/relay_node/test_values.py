@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 from typing import Any
 
 import pytest
 
 from relay_protocol.errors import Invalid
-from relay_server.relay_node.params import from_parameter, to_parameter
+from relay_server.relay_node.params import MAX_VALUES, from_parameter, to_parameter
 
 VALUES: list[tuple[Any, int | None, int, str]] = [
     (True, None, 1, "bool_value"),
@@ -71,3 +72,18 @@ def test_bytes_that_are_no_base64_are_distinguished() -> None:
     """Never by an internal error."""
     with pytest.raises(Invalid):
         from_parameter({"type": 5, "byte_array_value": "???"})
+
+
+def test_long_lists_are_refused_before_they_are_looked_at() -> None:
+    """Each value is looked at several times."""
+    for value in ([0] * (MAX_VALUES + 1), ["x"] * (MAX_VALUES + 1)):
+        with pytest.raises(Invalid, match="65536 values, not 65537"):
+            to_parameter(value)
+    longest = {"type": 5, "byte_array_value": base64.b64encode(bytes(MAX_VALUES)).decode()}
+    assert from_parameter(longest) == ([0] * MAX_VALUES,)
+    for reported in (
+        {"type": 5, "byte_array_value": base64.b64encode(bytes(MAX_VALUES + 2)).decode()},
+        {"type": 7, "integer_array_value": [0] * (MAX_VALUES + 1)},
+    ):
+        with pytest.raises(Invalid, match="more than 65536 values"):
+            from_parameter(reported)

@@ -46,6 +46,11 @@ export class Stream {
     this.drop()
   }
 
+  /** Sends a message if the websocket is open; otherwise it is lost. */
+  send(message: object): void {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message))
+  }
+
   /** Tries at once instead of waiting for the pause to end. */
   retryNow(): void {
     if (this.socket === null) this.dial()

@@ -1,6 +1,6 @@
 import { afterEach, beforeEach, expect, it, vi } from 'vitest'
 import { Refusal, Unreachable } from '../api/request'
-import { stopAll, stopByAllPaths } from './stop'
+import { stopByAllPaths, stopMany } from './stop'
 
 interface Sent {
   op: string
@@ -97,9 +97,18 @@ const LINES = [
 ]
 
 it('stops all robots by both paths at once, and the first complete answer counts', async () => {
-  const all = stopAll()
+  const open: object[] = []
+  const shown: number[] = []
+  const all = stopMany(
+    { robots: ['*'] },
+    (order) => open.push(order),
+    ({ results }) => shown.push(results.length),
+  )
+  // The open websocket takes it before any other path could fail.
+  expect(open).toHaveLength(1)
   await vi.advanceTimersByTimeAsync(0)
   const [socket] = Socket.all
+  expect(open).toEqual(socket!.sent)
   expect(socket!.url).toBe('ws://relay/api/v1/robots/stream')
   expect(socket!.sent[0]).toEqual({ robots: ['*'], do: 'stop', stop_id: requests[0]!.body.stop_id })
   expect(requests[0]!.path).toBe('/api/v1/fleet')
@@ -109,12 +118,13 @@ it('stops all robots by both paths at once, and the first complete answer counts
   expect(failure).toBe(null)
   expect(progress).toMatchObject({ meant: ['a', 'b'], done: true })
   expect(progress.results).toHaveLength(2)
+  expect(shown).toEqual([0, 1, 2, 2])
   expect(socket!.closed).toBe(true)
   expect(requests[0]!.signal!.aborted).toBe(true)
 })
 
 it('tells which robots of all are stopped when the answer breaks off', async () => {
-  const all = stopAll()
+  const all = stopMany({ robots: ['*'] })
   await vi.advanceTimersByTimeAsync(0)
   for (const line of LINES.slice(0, 2)) Socket.all[0]!.onmessage({ data: JSON.stringify({ event: 'order', data: line }) })
   Socket.all[0]!.onclose?.({ code: 1006, reason: '' })
@@ -129,7 +139,7 @@ it.each([
   [4404, 'the order matches no robot', new Refusal(403, 'The order matches no robot.')],
   [4503, '', new Unreachable()],
 ])('tells why no robot is stopped: %i', async (code, reason, end) => {
-  const all = stopAll()
+  const all = stopMany({ robots: ['*'] })
   await vi.advanceTimersByTimeAsync(0)
   Socket.all[0]!.onclose?.({ code, reason })
   await vi.runAllTimersAsync()

@@ -29,19 +29,30 @@ export async function stopByAllPaths(
   return result
 }
 
-/** Stops all robots of the user by HTTP and by a new websocket. Returns the first complete answer.
+/** Stops many robots by HTTP, by a new websocket and by the one of the live updates. Returns the first complete answer.
  *
  * If there is none, returns the longest one with the error that has a reason, else the first error.
+ *
+ * @param stop names, patterns or groups, and a reason
+ * @param sendOpen sends the order on a websocket that is open, without its answer
+ * @param show called with each progress
  */
-export async function stopAll(): Promise<{ progress: Progress; failure: unknown }> {
-  const order: Order = { robots: ['*'], do: 'stop', stop_id: newStopId() }
+export async function stopMany(
+  stop: Pick<Order, 'robots' | 'why'>,
+  sendOpen: (order: Order) => void = () => {},
+  show: (progress: Progress) => void = () => {},
+): Promise<{ progress: Progress; failure: unknown }> {
+  const order: Order = { ...stop, do: 'stop', stop_id: newStopId() }
   const rest = new AbortController()
   let longest = NOTHING_YET
+  sendOpen(order)
   const paths = [giveOrder, stopAllBySocket].map(async (give) => {
     let progress = NOTHING_YET
     const take = (line: OrderLine) => {
       progress = after(progress, line)
-      if (progress.results.length >= longest.results.length) longest = progress
+      if (progress.results.length < longest.results.length) return
+      longest = progress
+      show(longest)
     }
     await give(order, take, rest.signal)
     if (!progress.done) throw new Unreachable()

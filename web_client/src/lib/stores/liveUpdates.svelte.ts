@@ -5,7 +5,8 @@ import { app } from './appStore.svelte.ts'
 import { AlertBatch } from './alertBatching'
 import { notify } from './notifications'
 import { ALERTS } from '../route'
-import type { Alert, Robot } from '../api/types'
+import type { Alert, Order, Robot } from '../api/types'
+import type { Stream } from '../api/updates'
 import { relayTime } from '../relayClock'
 
 /** A shorter loss is not shown, milliseconds. */
@@ -27,6 +28,7 @@ class Watch {
   /** Number of alerts that are not acknowledged. */
   readonly waiting = $derived(waiting(this.alerts))
 
+  private stream: Stream | null = null
   private news = new News()
   private readonly lots = new AlertBatch((lot) => {
     app.notify(TONES[worst(standing(lot)) ?? 'info'], summary(lot), { path: ALERTS, label: 'Show alerts' })
@@ -51,18 +53,25 @@ class Watch {
       },
       location,
     )
+    this.stream = stream
     const retry = () => stream.retryNow()
     window.addEventListener('online', retry)
     stream.open()
     return () => {
       window.removeEventListener('online', retry)
       stream.close()
+      this.stream = null
       this.lots.end()
       this.robots = null
       this.alerts = []
       this.lostSince = this.unknown = null
       this.why = ''
     }
+  }
+
+  /** Sends an order to stop on the websocket of the updates, if it is open. Its answer is not awaited: the updates show it. */
+  order(stop: Order): void {
+    this.stream?.send(stop)
   }
 
   /** Whether the state has been unknown for so long that the page shows it; at a Unix time in seconds. */
