@@ -117,3 +117,26 @@ def test_a_cursor_that_the_relay_did_not_make_is_invalid(number: str) -> None:
     cursor = base64.urlsafe_b64encode(f'["a",{number}]'.encode()).decode()
     with pytest.raises(Invalid, match="'after'"):
         _place_of(cursor)
+
+
+def test_a_file_takes_no_more_than_was_offered(tmp_path: Path) -> None:
+    """Neither by more bytes, nor by a second offer of the same content with another size: quotas count the first."""
+    world = FileWorld(tmp_path)
+
+    def begin(size: int) -> Any:
+        done: list[Any] = []
+        Deferred.fromCoroutine(world.uploads.begin(world.robot_id, NEW._replace(size=size))).addBoth(
+            done.append
+        )
+        return done[0]
+
+    upload = begin(1000)
+    Deferred.fromCoroutine(upload.write(bytes(1000))).addErrback(pytest.fail)
+    refused: list[Any] = []
+    Deferred.fromCoroutine(upload.write(b"x")).addErrback(refused.append)
+    assert str(refused[0].value) == "more came than the 1000 bytes that were offered"
+    assert upload.ended
+    again = begin(50_000_000_000)
+    assert again.check(UploadRefused)
+    assert again.value.code == "mismatch"
+    assert str(again.value) == "the file of this name and SHA-256 has 1000 bytes, not 50000000000"

@@ -16,10 +16,12 @@ from relay_protocol.frames import FrameDecoder, SampleFrame
 from relay_protocol.function_link import FUNCTION_FRAME, CallFunction, decode_reply
 from relay_protocol.scopes import Scope
 from relay_server.http.limits import ConnectionLimits
+from relay_server.offload import service as module
 from relay_server.offload.job_store import KeyInUse, TooManyJobs
+from relay_server.offload.jobs import JobOwner
 from relay_server.offload.robot_link import MAX_LINKS, FunctionLinks
 from relay_server.offload.runner import Outcome
-from relay_server.offload.service import MAX_OF_OWNER, SAVE_SECONDS
+from relay_server.offload.service import DESCRIBE_SECONDS, MAX_OF_OWNER, SAVE_SECONDS
 from relay_server.robots.connection import LinkTiming, RobotConnection
 from tests.worlds.function_service import FunctionWorld, MemoryEngine, result
 from tests.worlds.robot_links import Transport
@@ -70,6 +72,54 @@ def test_a_stored_job_goes_on_once_a_worker_answers(world: FunctionWorld) -> Non
     world.engine.unavailable = False
     world.engine.on_change()
     assert (world.state(job.id), len(world.engine.runs)) == ("running", 1)
+
+
+def test_a_stored_job_fails_at_its_deadline_if_no_worker_comes(world: FunctionWorld) -> None:
+    """It is looked for one all the time."""
+    world.engine.slots = 0
+    job = result(world.submit(keep=True, deadline=100.0))
+    result(Deferred.fromCoroutine(world.service.stop()))
+    world.restart()
+    world.engine.unavailable = True
+    result(Deferred.fromCoroutine(world.service.start()))
+    world.clock.pump([10.0] * 9)
+    assert world.state(job.id) == "queued"
+    world.clock.pump([10.0] * 4)
+    found = result(Deferred.fromCoroutine(world.service.job(world.rover, job.id)))
+    assert (world.state(job.id), found.outcome.code) == ("failed", "deadline")
+    assert "no worker answered" in found.outcome.error
+
+
+def test_a_call_does_not_wait_until_the_workers_are_asked_again(
+    world: FunctionWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They answer only when one of their processes is free."""
+    result(world.submit())
+    asked: list[Deferred[Any]] = []
+
+    def describe() -> Deferred[Any]:
+        asked.append(Deferred())
+        return asked[-1]
+
+    monkeypatch.setattr(world.engine, "describe", describe)
+    world.clock.advance(DESCRIBE_SECONDS + 1)
+    for _ in range(3):
+        result(world.submit())
+    assert (len(world.engine.runs), len(asked)) == (4, 1)
+
+
+def test_the_arguments_of_one_caller_leave_room_for_others(
+    world: FunctionWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MAX_BYTES_OF_OWNER", 2)
+    for _ in range(2):
+        result(world.submit())
+    with pytest.raises(
+        TooManyJobs, match="calls of robot:rover that wait or run have 2 bytes, and may have 2"
+    ):
+        result(world.submit())
+    other = JobOwner("user", world.ann.user_id, "ann", "default")
+    result(world.submit(payer=other))
 
 
 def test_a_job_that_could_not_be_stored_is_not_run(world: FunctionWorld) -> None:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
+import socket
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, cast
+
 import pytest
 
-from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from relay_protocol.function_link import FunctionReply
 from relay_protocol.functions import CallFailed
-from robot_client.offload.cloud import result_of
+from robot_client.offload import function_link, offload
+from robot_client.offload.cloud import Cloud, result_of
+from robot_client.offload.function_link import FunctionConnection
 
 
 @pytest.mark.parametrize(
@@ -23,3 +31,85 @@ def test_a_call_for_which_there_is_no_worker_is_unavailable(
 ) -> None:
     with pytest.raises(error, match="no worker"):
         result_of(FunctionReply(state=state, code=code, error="no worker"))
+
+
+class Robot:
+    """A node with a method that may run in the cloud."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+
+    @offload("double", when=lambda device: False)
+    def doubled(self, number: int = 4) -> int:
+        """Here."""
+        self.seen.append(number)
+        return 2 * number
+
+
+class Calls(Cloud):
+    """Records calls."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[str, dict[str, Any]]] = []
+
+    def call(self, function: str, /, **arguments: Any) -> Any:
+        for option in ("timeout", "newest", "version"):
+            arguments.pop(option)
+        self.calls.append((function, arguments))
+        return 0
+
+
+def test_a_method_may_be_offloaded() -> None:
+    """Its object is not sent. Where it runs can be read from the class and from an object."""
+    robot, client = Robot(), Calls()
+    assert (robot.doubled(3), robot.seen) == (6, [3])
+    Robot.doubled._cloud, Robot.doubled._when = client, lambda device: True
+    assert (robot.doubled(5), robot.doubled(number=6)) == (0, 0)
+    assert client.calls == [("double", {"number": 5}), ("double", {"number": 6})]
+    assert robot.doubled.latest.where == Robot.doubled.latest.where == "cloud"
+    assert robot.seen == [3]
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cloud, socket.socket]]:
+    """A robot whose link takes a few bytes, and the other end."""
+    ours, other = socket.socketpair()
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+    monkeypatch.setattr(function_link, "_dial", lambda enrolment: ours)
+    monkeypatch.setattr(FunctionConnection, "_greet", lambda self: None)
+    enrolment, identity = cast(Any, SimpleNamespace(address="relay")), cast(Any, None)
+    connection = FunctionConnection(enrolment, identity)
+    client = Cloud()
+    monkeypatch.setattr(client, "_dial", lambda: connection)
+    yield client, other
+    connection.close("over")
+    other.close()
+
+
+def test_a_call_that_was_not_sent_in_time_has_not_run(slow: tuple[Cloud, socket.socket]) -> None:
+    """It is withdrawn, so it is never sent, and the next one does not wait behind it."""
+    client, _ = slow
+    with pytest.raises(CallFailed, match="it may have run"):
+        client.call("look", timeout=0.3, frame=bytes(1_000_000))
+    for _ in range(3):
+        with pytest.raises(Unavailable, match=r"could not be sent in 0\.1 s"):
+            client.call("look", timeout=0.1, frame=bytes(1_000_000))
+    assert client._connection is not None
+    assert not client._connection._waiting
+    for _ in range(60):
+        client.submit("look", frame=bytes(1_000_000))
+    with pytest.raises(Unavailable, match="bytes of calls wait for the slow link"):
+        for _ in range(10):
+            client.submit("look", frame=bytes(1_000_000))
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, 86_401.0, math.nan])
+def test_a_time_that_the_relay_would_refuse_is_refused_before(seconds: float) -> None:
+    """The relay closes the link on an invalid request, and other calls of the program with it."""
+    with pytest.raises(Invalid, match="must be more than 0 and at most 86400 s"):
+        Cloud().call("look", timeout=seconds)
+    with pytest.raises(Invalid, match="deadline"):
+        Cloud().submit("look", deadline=seconds)
+    with pytest.raises(Invalid, match="the key has 300 characters"):
+        Cloud().submit("look", key="x" * 300)
