@@ -75,4 +75,5 @@ document.addEventListener('visibilitychange', () => {
   else if (socket === null) begin()
 })
 
-begin()
+// A ticket may have ended when the page is seen.
+if (!document.hidden || !reconnects) begin()
