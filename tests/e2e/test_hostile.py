@@ -257,9 +257,9 @@ BAD_ROSBRIDGE = {
         b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":nan}}}',
         "not JSON",
     ),
-    "a key twice": (b'{"op":"publish","topic":"/cmd_vel","topic":"/x","msg":{}}', "'topic' twice"),
+    "a key twice": (b'{"op":"unadvertise","topic":"/cmd_vel","topic":"/x"}', "'topic' twice"),
     "a key twice in a body": (
-        b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":0,"x":1}}}',
+        b'{"op":"call_service","service":"/reset","args":{"a":{"x":0,"x":1}}}',
         "'x' twice",
     ),
     "no object": (b'"hello"', "object"),
