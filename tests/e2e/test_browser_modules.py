@@ -16,6 +16,7 @@ from tests.worlds.browser import checked_pages, open_session, running_world, see
 from tests.worlds.module_settings import MODULES
 from tests.worlds.relay_process import Relay
 from tests.worlds.robot_process import Robot
+from tests.worlds.waiting import wait_for
 
 PASSWORD = "correct horse"
 WAIT_SECONDS = 60.0
@@ -142,9 +143,14 @@ def test_a_log_is_read_backwards_and_by_level(page: Page) -> None:
 def processes(page: Page) -> Locator:
     """The table, with rows of the daemon and the modules."""
     toggle = seen(page, "processes-toggle")
-    if toggle.get_attribute("aria-expanded") == "false":
-        toggle.click()
-        expect(toggle).to_have_attribute("aria-expanded", "true")
+
+    def opened() -> bool:
+        """While panels above it load, a click may miss it."""
+        if toggle.get_attribute("aria-expanded") == "false":
+            toggle.click()
+        return toggle.get_attribute("aria-expanded") == "true"
+
+    wait_for("the table of processes opens", opened)
     table = seen(page, "processes")
     for part in ("daemon", "guard", "base"):
         # If it fails, it says what the table shows.
