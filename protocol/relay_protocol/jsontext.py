@@ -40,18 +40,26 @@ def check_text(data: bytes, depth: int = JSON_DEPTH) -> None:
 
     :param data: the whole message
     :param depth: deepest nesting allowed
-    :raises MalformedMessage: invalid UTF-8 (RFC 8259 section 8.1) or nesting deeper than ``depth``
+    :raises MalformedMessage: invalid UTF-8 or nesting deeper than ``depth``
     """
     if not data.isascii():
-        try:
-            str(data, "utf-8")
-        except UnicodeDecodeError as error:
-            raise MalformedMessage(f"the message is not valid UTF-8 (byte {error.start})") from None
+        check_utf8(data)
     # Too few bytes, or fewer opening brackets than the limit, can't be nested deeper. Each level takes two bytes of a
     # list, and five of an object (``{"":`` and ``}``).
     least = depth * (2 if _LIST in data else 5)
     if len(data) > least and _opens_more_than(depth, data) and _deepest(data) > depth:
         raise MalformedMessage(f"the message nests arrays and objects deeper than {depth}")
+
+
+def check_utf8(data: bytes) -> None:
+    """Refuse bytes that are not UTF-8 (RFC 8259 section 8.1).
+
+    :raises MalformedMessage: with the first wrong byte
+    """
+    try:
+        data.decode()
+    except UnicodeDecodeError as error:
+        raise MalformedMessage(f"the message is not valid UTF-8 (byte {error.start})") from None
 
 
 def _opens_more_than(most: int, data: bytes) -> bool:
@@ -207,7 +215,7 @@ encode = msgspec.json.Encoder().encode
 
 # --- keys -------------------------------------------------------------------------------------------------
 
-_SHORT_BYTES = 2048
+SHORT_BYTES = 2048
 """Length up to which a text is decoded and encoded again."""
 
 _NOT_BRACES = bytes(byte for byte in range(256) if byte not in b"{}")
@@ -228,7 +236,7 @@ def check_keys(data: bytes) -> None:
     :param data: JSON that passed :func:`check_text`; ``NaN`` and ``Infinity`` are let through
     :raises MalformedMessage: the sentence names the key
     """
-    if len(data) <= _SHORT_BYTES:
+    if len(data) <= SHORT_BYTES:
         if _survives(data):
             return
     elif b"\\" not in data and _distinct_by_quotes(data):
@@ -264,7 +272,7 @@ def _distinct_by_quotes(data: bytes) -> bool:
     """
     keys: set[bytes] = set()
     outer: list[set[bytes]] = []
-    most = max(len(data) // _SPARSE, _SHORT_BYTES)
+    most = max(len(data) // _SPARSE, SHORT_BYTES)
     begun = at = 0
     for _ in range(most):
         start = data.find(b'"', at)

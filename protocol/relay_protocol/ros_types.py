@@ -151,13 +151,22 @@ class TypeRegistry:
             found = made[type_name] = compiled.writer(name, checked)
         return found
 
-    def check(self, type_name: str) -> Check:
-        """The check of texts for robots that speak JSON; faster than writing. See :meth:`reader`.
+    def command_writer(self, type_name: str) -> Writer:
+        """The :meth:`writer` of commands of this type, as checked text. It refuses numbers that are not finite.
 
         :raises NotFound: the type is not registered
         """
         name, types = self._find(type_name)
-        return types.check(name)
+        return types.command_writer(name)
+
+    def check(self, type_name: str, commands: bool = False) -> Check:
+        """The check of texts for robots that speak JSON; faster than writing. See :meth:`reader`.
+
+        :param commands: whether it refuses what :meth:`command_writer` refuses
+        :raises NotFound: the type is not registered
+        """
+        name, types = self._find(type_name)
+        return types.check(name, commands)
 
     def is_stamped(self, type_name: str) -> bool:
         """Whether messages of this type have a header somewhere, whose stamp a client may leave out.

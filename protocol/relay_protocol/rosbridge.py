@@ -178,8 +178,10 @@ ClientOp = (
 )
 
 _LIST = ord("[")
-_SHALLOW = 5 * JSON_DEPTH
-"""A shorter text is not nested too deeply: each nested object takes at least five bytes, ``{"":`` and ``}``."""
+_FEW_LISTS = 16
+_SHALLOW = 5 * (JSON_DEPTH - _FEW_LISTS)
+"""A shorter text with few lists is not nested too deeply: an object in another takes at least five bytes, ``{"":`` and
+``}``."""
 
 _TOLERATED_FAULTS = ("got `null`", "got `float`")
 """Parts of msgspec's errors about a field that is null, or no integer: decoding is tried again without these."""
@@ -204,11 +206,13 @@ def decode(data: bytes) -> ClientOp:
     :raises TooCostly: see :func:`relay_protocol.json_cost.check`; with NaN or infinity
         :func:`relay_protocol.json_cost.check_literals`
     """
-    # The checks of jsontext.decode, with fewer calls, as this runs for every message of every client. A short ASCII
-    # text without a list needs no check of UTF-8, nesting and cost: it is too short to be nested too deeply.
-    if _LIST in data or len(data) > _SHALLOW or not data.isascii():
+    # The checks of jsontext.decode, with fewer calls, as this runs for every message of every client. A short text
+    # needs no check of cost, and with few lists none of nesting: it is too short to be nested too deeply.
+    if len(data) > _SHALLOW or (_LIST in data and data.count(_LIST) > _FEW_LISTS):
         json_cost.check(data)
         jsontext.check_text(data)
+    elif not data.isascii():
+        jsontext.check_utf8(data)
     try:
         message = _decode(data)
     except jsontext.FAULTS as error:

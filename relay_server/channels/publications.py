@@ -334,27 +334,28 @@ class Publications:
         ):
             return None
         try:
-            convert = self._converter(publication.type)
+            convert = self._converter(publication.type, publication.motion)
         except SwitchboardError as error:
             # The definition is known but is not that of a message, for example of a service.
             self.refused(publication.number, str(error))
             return None
-        if publication.motion:
-            convert = _finite(convert)
         publication.send = channel_link.message_sender(
             publication.number, convert, commands=publication.motion
         )
         return publication.send
 
-    def _converter(self, type_name: str) -> Callable[[bytes], bytes]:
+    def _converter(self, type_name: str, commands: bool) -> Callable[[bytes], bytes]:
         """The function that converts JSON to the robot's encoding.
 
+        :param commands: whether it refuses numbers that are not finite
         :raises SwitchboardError: it is not the type of a message
         """
         types, now_ns = self._link_state.robot.types, self._now_ns
         if not self._link_state.cdr:
-            return types.check(type_name) if types.knows(type_name) else _json_of_unknown_type
-        write = types.writer(type_name, checked=True)
+            if types.knows(type_name):
+                return types.check(type_name, commands)
+            return _command_of_unknown_type if commands else _json_of_unknown_type
+        write = types.command_writer(type_name) if commands else types.writer(type_name, checked=True)
         return (lambda body: write(body, now_ns())) if types.is_stamped(type_name) else write
 
     def _enqueue(self, publication: RobotPublication, message: QueuedMessage) -> None:
@@ -598,17 +599,6 @@ def _notify_dropped(publication: RobotPublication, message: QueuedMessage, reaso
     message.member.notify("error", f"publish {publication.topic}: {reason}", message.id)
 
 
-def _finite(convert: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """A converter of commands, which refuses numbers that are not finite."""
-
-    def convert_command(body: bytes) -> bytes:
-        converted = convert(body)
-        nonfinite.require_finite(body)
-        return converted
-
-    return convert_command
-
-
 def _json_of_unknown_type(body: bytes) -> bytes:
     """A message for a robot that speaks JSON, of a type that is not known: any object that all readers can parse.
 
@@ -623,6 +613,13 @@ def _json_of_unknown_type(body: bytes) -> bytes:
         except ValueError as error:
             raise Invalid(f"the message can't be read: {error}") from None
     return json_for_robot(body)
+
+
+def _command_of_unknown_type(body: bytes) -> bytes:
+    """As :func:`_json_of_unknown_type`; its numbers are finite."""
+    converted = _json_of_unknown_type(body)
+    nonfinite.require_finite(body)
+    return converted
 
 
 _BRACE = ord("{")

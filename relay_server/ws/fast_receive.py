@@ -222,7 +222,7 @@ class FastProtocol(WebSocketServerProtocol):
 
 def _is_utf8(payload: bytes) -> bool:
     try:
-        str(payload, "utf-8")
+        payload.decode()
     except UnicodeDecodeError:
         return False
     return True

@@ -65,7 +65,7 @@ def accepted(text: str) -> bool:
     return True
 
 
-@given(TEXTS, st.sampled_from([0, jsontext._SHORT_BYTES, 40 * jsontext._SHORT_BYTES]))
+@given(TEXTS, st.sampled_from([0, jsontext.SHORT_BYTES, 40 * jsontext.SHORT_BYTES]))
 @example('{"x":1,"\\u0078":2}', 0)
 @example('{"x1":1,"x2":2}', 0)
 @example('{"a":"\\u003a","b":1,"b":2}', 0)

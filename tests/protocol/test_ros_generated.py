@@ -12,7 +12,7 @@ from typing import Any
 
 import cbor2
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from relay_protocol import jsontext, nonfinite
@@ -500,16 +500,44 @@ def test_a_check_takes_what_a_writer_takes(value: dict[str, Any]) -> None:
         written = write(text)
     except Invalid as error:
         with pytest.raises(Invalid, match=f"^{re.escape(str(error))}$"):
-            CHECKED_TYPES.check("a/msg/C")(text)
+            CHECKED_TYPES.check("a/msg/C", False)(text)
     else:
-        checked = CHECKED_TYPES.check("a/msg/C")(text)
+        checked = CHECKED_TYPES.check("a/msg/C", False)(text)
         if checked != nonfinite.marks_to_null(text):
             assert json.loads(checked).keys() == {*CHECKED_FIELDS} - {"other"}
             assert write(checked) == written
 
 
+FLOATS = CompiledTypes("a/msg/F", "float32[2] pair\nfloat64[] many\nfloat32 one\nstring text")
+FLOAT = st.sampled_from([0, 1.5, 1e39, 1e999, -1e999, math.nan, None, "\0NaN", "\0Infinity", "null"])
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["pair", "many", "one", "text"]), FLOAT | st.lists(FLOAT, min_size=2, max_size=2)
+    )
+)
+@example({"text": "null"})
+@example({"many": [None, 1]})
+@example({"many": [1, "\0Infinity"]})
+def test_a_command_is_what_a_writer_takes_and_finite(value: dict[str, Any]) -> None:
+    """Of types with lists and without, as CDR and as JSON: the same bytes, or an error."""
+    for types, name in ((FLOATS, "a/msg/F"), (CHECKED_TYPES, "a/msg/C")):
+        fields = value if types is FLOATS else {"single": value.get("one", 0), "text": value.get("text", "")}
+        text = json.dumps(nonfinite.from_floats(fields)).encode()
+        try:
+            wanted = types.writer(name, True)(text), types.check(name, False)(text)
+            nonfinite.require_finite(text)
+        except Invalid as error:
+            for convert in (types.command_writer(name), types.check(name, True)):
+                with pytest.raises(Invalid, match=f"^{re.escape(str(error))}$"):
+                    convert(text)
+        else:
+            assert (types.command_writer(name)(text), types.check(name, True)(text)) == wanted
+
+
 def test_types_with_arrays_are_checked_by_writing() -> None:
-    check = PLAIN_COMPILED.check("a/msg/P")
+    check = PLAIN_COMPILED.check("a/msg/P", False)
     check(b'{"pair":[1,2]}')
     with pytest.raises(Invalid, match="pair"):
         check(b'{"pair":[1,2,3]}')

@@ -13,7 +13,7 @@ from relay_protocol import json_cost, jsontext, nonfinite
 from relay_protocol.errors import Invalid, MalformedMessage
 from relay_protocol.ros import generated_cdr_to_json, generated_json_to_cdr
 from relay_protocol.ros.cdr_to_json import HEADER_BYTES, ReaderFactory
-from relay_protocol.ros.definition import HEADER, Definition, parse
+from relay_protocol.ros.definition import HEADER, Definition, Shape, parse
 from relay_protocol.ros.generated_json_to_cdr import LARGEST_BODY, Check
 from relay_protocol.ros.json_to_cdr import Mismatch, WriterFactory, as_invalid
 
@@ -62,7 +62,7 @@ class CompiledTypes:
         self._slow_readers: dict[tuple[str, str], ReaderFactory] = {}
         self._readers: dict[tuple[str, str], Reader] = {}
         self._writers: dict[str, tuple[Writer, Writer]] = {}
-        self._checks: dict[str, Check] = {}
+        self._checks: dict[tuple[str, bool], Check] = {}
 
     def reader(self, name: str, form: str) -> Reader:
         """The reader of a message type for ``json`` or ``cbor``."""
@@ -104,21 +104,35 @@ class CompiledTypes:
             found = self._writers[name] = (cast(Writer, made(strict)), cast(Writer, made(trusting)))
         return found[checked]
 
-    def check(self, name: str) -> Check:
+    def command_writer(self, name: str) -> Writer:
+        """The writer of a message type for commands, as checked text: their numbers are finite.
+
+        Generated code takes no other numbers, but in lists.
+        """
+        if _has_lists_of_floats(name, self.definitions):
+            return _finite(self.writer(name, checked=True))
+        made = generated_json_to_cdr.generate(name, self.definitions)
+        return cast(Writer, made(_finite(self._slow_writer(name, _decode))))
+
+    def check(self, name: str, commands: bool) -> Check:
         """The check of a text for robots that speak JSON; it takes what :meth:`writer` takes; returns what they get.
 
-        Of a type without arrays that has all fields of the type. Other texts, and long ones, stay as they are.
+        A short text of a type without lists is written anew, with all fields of the type. Others stay as they are.
+
+        :param commands: whether it takes what :meth:`command_writer` takes
         """
-        found = self._checks.get(name)
+        found = self._checks.get((name, commands))
         if found is None:
             write = self.writer(name, checked=True)
 
             def check_by_writing(body: bytes) -> bytes:
                 write(body)
+                if commands:
+                    nonfinite.require_finite(body)
                 return json_for_robot(body)
 
             made = generated_json_to_cdr.generate_check(name, self.definitions)
-            found = self._checks[name] = made(check_by_writing) if made else check_by_writing
+            found = self._checks[name, commands] = made(check_by_writing) if made else check_by_writing
         return found
 
     def is_stamped(self, name: str) -> bool:
@@ -158,6 +172,28 @@ def json_for_robot(body: bytes) -> bytes:
     if len(body) > LARGEST_BODY:
         raise Invalid(f"the message has {len(body)} bytes as JSON; a robot takes at most {LARGEST_BODY}")
     return body
+
+
+def _finite(write: Writer) -> Writer:
+    """A writer of commands, which refuses numbers that are not finite."""
+
+    def write_command(body: bytes, now_ns: int = 0, /) -> bytes:
+        written = write(body, now_ns)
+        nonfinite.require_finite(body)
+        return written
+
+    return write_command
+
+
+def _has_lists_of_floats(name: str, definitions: dict[str, Definition]) -> bool:
+    """Whether a type has lists of floating-point numbers, in which ``null`` is NaN."""
+    return any(
+        field.type.shape is not Shape.SCALAR
+        and field.type.primitive is not None
+        and type(field.type.primitive.zero) is float
+        for each in _contained(name, definitions)
+        for field in definitions[each].fields
+    )
 
 
 def _contained(name: str, definitions: dict[str, Definition]) -> set[str]:

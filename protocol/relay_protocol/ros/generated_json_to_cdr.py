@@ -70,7 +70,7 @@ def generate(name: str, definitions: dict[str, Definition]) -> Callable[[Write],
 
 
 def generate_check(name: str, definitions: dict[str, Definition]) -> Callable[[Check], Check] | None:
-    """Generate a check of whether the writer takes a text. It returns the text with all fields of the type.
+    """Generate a check of whether the writer takes a text; see :meth:`relay_protocol.ros.compiled.CompiledTypes.check`.
 
     :returns: what takes a check by writing, for unusual texts, and returns the whole check; ``None`` for types with
         arrays
@@ -107,9 +107,11 @@ class _CheckGenerator:
         if self._codes:
             pack = source.constant(struct.Struct("<" + "".join(self._codes)).pack)
             source.line(f"{pack}({', '.join(self._numbers)})")
-        # The message has no mark of :mod:`relay_protocol.nonfinite`: a mark is a string with a NUL. It is encoded
-        # again, so that the robot gets what was checked, also of a text that has a key twice.
-        source.line(f"return {source.constant(jsontext.encode)}(m)")
+        # The message has no mark of :mod:`relay_protocol.nonfinite`: a mark is a string with a NUL. A short one is
+        # encoded again, so that the robot gets what was checked, also of a text that has a key twice.
+        source.line(f"if len(body) <= {jsontext.SHORT_BYTES}: return {source.constant(jsontext.encode)}(m)")
+        source.line(f"{source.constant(jsontext.check_keys)}(body)")
+        source.line("return body")
 
     def _message(self, name: str, value: str) -> None:
         definition = self._definitions[name]
