@@ -117,7 +117,7 @@ class CompiledTypes:
     def check(self, name: str, commands: bool) -> Check:
         """The check of a text for robots that speak JSON; it takes what :meth:`writer` takes; returns what they get.
 
-        A short text of a type without lists is written anew, with all fields of the type. Others stay as they are.
+        A short text of a type without lists is encoded again, with all fields of the type. Others stay as they are.
 
         :param commands: whether it takes what :meth:`command_writer` takes
         """
