@@ -10,10 +10,13 @@ import fnmatch
 import hashlib
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from relay_protocol.limits import FILE_NAME, MIB
+
+HASHED_AT_ONCE = 16 * MIB
+"""Bytes that are hashed before a thread does other work, so that a large file does not hold up small ones."""
 
 MAX_DEPTH = 32
 """Levels of folders below a group's folder that are searched."""
@@ -108,20 +111,27 @@ class OpenFile:
             os.close(self._descriptor)
             raise OSError("it is not a regular file")
         self.state = FileState.of(found)
+        self._digest = hashlib.sha256()
+        self._hashed = 0
 
-    def sha256(self, cancelled: Callable[[], bool]) -> str:
-        """The hash of the contents, hexadecimal.
+    def hash_part(self) -> bool:
+        """Hash up to :data:`HASHED_AT_ONCE` further bytes; whether there may be more.
 
-        :param cancelled: whether the result is not needed any more
-        :raises OSError: it can't be read, or was cancelled
+        :raises OSError: it can't be read
         """
-        digest, offset = hashlib.sha256(), 0
-        while part := os.pread(self._descriptor, MIB, offset):
-            if cancelled():
-                raise OSError("the robot's daemon is shutting down")
-            digest.update(part)
-            offset += len(part)
-        return digest.hexdigest()
+        end = self._hashed + HASHED_AT_ONCE
+        while self._hashed < end:
+            part = os.pread(self._descriptor, MIB, self._hashed)
+            if not part:
+                return False
+            self._digest.update(part)
+            self._hashed += len(part)
+        return True
+
+    @property
+    def sha256(self) -> str:
+        """The hash of what was hashed, hexadecimal."""
+        return self._digest.hexdigest()
 
     def read(self, offset: int, size: int) -> bytes:
         """:raises OSError: it can't be read"""

@@ -7,7 +7,7 @@ everything: after a crash they are found again, and the relay says how far each 
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Any, NamedTuple
@@ -17,11 +17,12 @@ from twisted.internet.protocol import Factory
 from twisted.logger import Logger
 
 from relay_protocol import link
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import SwitchboardError, Unavailable
 from robot_client.alerts import AlertCondition, OnAlert
 from robot_client.files.confirmed import ConfirmedFiles
 from robot_client.files.file_link import FileConnection, FileRefused, build_file_link
 from robot_client.files.folder import (
+    FileState,
     FoundFile,
     OpenFile,
     UnusableName,
@@ -54,6 +55,12 @@ LINK_SECONDS = 10.0
 
 MOST_DELAYED = 10_000
 """Files that are remembered because they are to be tried again later."""
+
+MOST_HASHES = 1000
+"""Files of which the hash is remembered until they are stored, so that a lost link does not cost it."""
+
+MISMATCHES = 3
+"""After this many copies in a row that differ from their file there is an alert."""
 
 FILES = "files"
 """Kind of alerts about files."""
@@ -103,11 +110,16 @@ class FileUploader:
         self._wall = wall
         self._log = Logger("files")
         self._problems = {each.name: AlertCondition(alert, FILES, each.name) for each in self._groups}
+        self._folders = {
+            each.name: AlertCondition(alert, FILES, f"{each.name}: folder") for each in self._groups
+        }
         self._registered = False
         self._heartbeat = 1.0
         self._waiting: deque[_Candidate] = deque()
         self._under_way: set[str] = set()
         self._delayed: dict[str, float] = {}
+        self._hashes: dict[str, tuple[FileState, str]] = {}
+        self._mismatches: Counter[str] = Counter()
         self._connection: FileConnection | None = None
         self._asked_at: float | None = None
         self._attempt: Deferred[Any] | None = None
@@ -115,6 +127,9 @@ class FileUploader:
         self._scanning = False
         self._next_scan = self._scan_seconds = 0.0
         self._search: Iterator[_Candidate] | None = None
+        self._searched: list[FileGroupSettings] = []
+        self._unreadable: dict[str, str] = {}
+        """Why the folders of groups can't be searched, by group; written in threads."""
         self._stopped = False
 
     @property
@@ -187,8 +202,9 @@ class FileUploader:
         self._scanning = True
         began = self._clock.seconds()
         if self._search is None:
-            groups = [each for each in self._groups if each.when == "always" or self._full()]
-            self._search = self._find(groups)
+            self._searched = [each for each in self._groups if each.when == "always" or self._full()]
+            self._unreadable = {}
+            self._search = self._find(self._searched, self._unreadable)
 
         def done(found: list[_Candidate]) -> None:
             self._scanning = False
@@ -196,6 +212,7 @@ class FileUploader:
             self._scan_seconds += now - began
             if len(found) < BATCH:
                 self._search = None
+                self._update_folders()
                 self._next_scan = now + max(SCAN_SECONDS, SCAN_SHARE * self._scan_seconds)
                 self._scan_seconds = 0.0
                 self._delayed = {name: until for name, until in self._delayed.items() if until > now}
@@ -212,17 +229,26 @@ class FileUploader:
         self._next_scan = self._clock.seconds() + 60.0
         self._log.failure("searching for files failed", failure)
 
-    def _find(self, groups: list[FileGroupSettings]) -> Iterator[_Candidate]:
-        """The files to upload, group by group. It is continued in threads, one batch after the other."""
+    def _update_folders(self) -> None:
+        for group in self._searched:
+            reason = self._unreadable.get(group.name, "")
+            self._folders[group.name].update(
+                reason and f"the folder of the file group {group.name} can't be read: {reason}",
+                f"the folder of the file group {group.name} can be read again",
+            )
+
+    def _find(
+        self, groups: list[FileGroupSettings], unreadable: dict[str, str]
+    ) -> Iterator[_Candidate]:
+        """The files to upload, group by group. It is continued in threads, one batch after the other.
+
+        :param unreadable: gets the groups whose folder can't be read, with the reason
+        """
         for group in groups:
             try:
                 yield from self._settled(group)
             except OSError as error:
-                self._log.warn(
-                    "the folder of the file group {group} can't be read: {reason}",
-                    group=group.name,
-                    reason=error.strerror,
-                )
+                unreadable[group.name] = error.strerror or str(error)
 
     def _settled(self, group: FileGroupSettings) -> Iterator[_Candidate]:
         """Files of a group that are not written any more, and not confirmed yet."""
@@ -261,7 +287,7 @@ class FileUploader:
         except FileNotFoundError:
             return
         try:
-            sha256 = await self._in_thread(file.sha256, lambda: self._stopped)
+            sha256 = await self._hash(candidate.name, file)
             if file.changed() or file.state != found.state:
                 self._delay(candidate, group.settle_seconds)
                 return
@@ -284,9 +310,28 @@ class FileUploader:
         else:
             self._delay(candidate, group.settle_seconds)
 
+    async def _hash(self, name: str, file: OpenFile) -> str:
+        """The hash of a file, hexadecimal.
+
+        :raises OSError: it can't be read
+        :raises SwitchboardError: the daemon is shutting down
+        """
+        state, sha256 = self._hashes.get(name, (None, ""))
+        if state == file.state:
+            return sha256
+        while await self._in_thread(file.hash_part):
+            if self._stopped:
+                raise Unavailable("the robot's daemon is shutting down")
+        if len(self._hashes) >= MOST_HASHES:
+            del self._hashes[next(iter(self._hashes))]
+        self._hashes[name] = file.state, file.sha256
+        return file.sha256
+
     async def _stored(self, candidate: _Candidate) -> None:
         """The relay has confirmed the file as it is now."""
         group, found = candidate
+        self._hashes.pop(candidate.name, None)
+        self._mismatches.pop(candidate.name, None)
         self._problems[group.name].update("", f"files of the group {group.name} are uploaded again")
         if group.after == "delete":
             await self._in_thread(delete_unchanged, group.folder, found.path, found.state)
@@ -298,7 +343,7 @@ class FileUploader:
         group = candidate.group.name
         if isinstance(error, FileRefused):
             self._delay(candidate, error.retry_after)
-            if error.code == "mismatch":
+            if error.code == "mismatch" and not self._keeps_differing(candidate.name):
                 return
             if error.code in ("quota", "disk_full"):
                 # The others of this group would be refused as well.
@@ -320,6 +365,15 @@ class FileUploader:
         group, name = candidate.group.name, candidate.name.encode("utf-8", "replace").decode()
         self._log.warn("{name} can't be uploaded: {reason}", name=name, reason=reason)
         self._problems[group].update(f"a file of the group {group} can't be uploaded: {reason}", "")
+
+    def _keeps_differing(self, name: str) -> bool:
+        """Note that the relay's copy differs from what was hashed; whether it has done so several times in a row."""
+        # It may have been written without a trace in its state.
+        self._hashes.pop(name, None)
+        if len(self._mismatches) >= MOST_DELAYED:
+            self._mismatches.clear()
+        self._mismatches[name] += 1
+        return self._mismatches[name] >= MISMATCHES
 
     def _delay(self, candidate: _Candidate, seconds: float) -> None:
         if len(self._delayed) < MOST_DELAYED:
