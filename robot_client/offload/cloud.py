@@ -32,6 +32,8 @@ CALL_SECONDS = 10.0
 RETRY_SECONDS = 2.0
 """After a failed attempt to reach the relay, calls fail at once for so long."""
 
+_CLOSED = "the program has closed the link"
+
 DONE = frozenset({"done", "failed", "cancelled", "refused"})
 
 
@@ -45,6 +47,8 @@ class Cloud:
         self._folder = folder
         self._lock = threading.Lock()
         self._connection: FunctionConnection | None = None
+        self._dialled: Future[FunctionConnection] | None = None
+        """The link while it is being dialled."""
         self._failed_at = -RETRY_SECONDS
         self._failure = ""
 
@@ -55,14 +59,15 @@ class Cloud:
         *,
         timeout: float = CALL_SECONDS,
         version: int | None = None,
-        newest: bool = False,
+        newest: bool | str = False,
         **arguments: Any,
     ) -> Any:
         """Run a function and wait for its result.
 
-        :param timeout: seconds, for everything
+        :param timeout: seconds, for everything, also to reach the relay
         :param newest: while a call of this function is under way, the next one waits, and gives way to a newer one.
-            So a slow uplink carries the newest frame
+            So a slow uplink carries the newest frame. A text, such as a camera's name, keeps the calls of one camera
+            apart from those of others
         :raises CallFailed: there is no result; the code says why. After ``lost`` and ``timeout`` it may have run
         :raises Unavailable: the relay or its workers can't be reached, or the call could not be sent in time; it did
             not run
@@ -73,8 +78,9 @@ class Cloud:
             function=function, arguments=_encode(arguments), version=version, deadline=timeout
         )
         began = time.monotonic()
-        connection = self._connected()
-        reply = connection.begin(msgspec.msgpack.encode(request), function if newest else "")
+        connection = self._connected(timeout)
+        stream = f"{function} {newest}" if newest else ""
+        reply = connection.begin(msgspec.msgpack.encode(request), stream)
         try:
             return result_of(_wait(reply.future, timeout - (time.monotonic() - began), function))
         except CallFailed as error:
@@ -113,7 +119,7 @@ class Cloud:
             keep=True,
             key=key,
         )
-        return Handle(self, self._begin(request).future)
+        return Handle(self, self._begin(request, CALL_SECONDS).future)
 
     def handle(self, job: str) -> Handle:
         """A job by its id, such as one of an earlier run of this program."""
@@ -127,32 +133,60 @@ class Cloud:
         :raises CallFailed: no answer came in time, or the link was lost
         :raises Unavailable: the relay can't be reached
         """
-        return _wait(self._begin(request).future, timeout, "")
+        end = time.monotonic() + timeout
+        reply = self._begin(request, timeout)
+        return _wait(reply.future, end - time.monotonic(), "")
 
     def close(self) -> None:
         """Close the link. Calls that run fail."""
         with self._lock:
-            if self._connection is not None:
-                self._connection.close("the program has closed the link")
-            self._connection = None
+            connection, self._connection, self._dialled = self._connection, None, None
+        if connection is not None:
+            connection.close(_CLOSED)
 
-    def _begin(self, request: CallFunction | CancelFunction | FetchResult) -> Reply:
-        return self._connected().begin(msgspec.msgpack.encode(request))
+    def _begin(self, request: CallFunction | CancelFunction | FetchResult, seconds: float) -> Reply:
+        return self._connected(seconds).begin(msgspec.msgpack.encode(request))
 
-    def _connected(self) -> FunctionConnection:
+    def _connected(self, seconds: float) -> FunctionConnection:
+        """The link; it is dialled in a thread of its own, once for all callers, as a lookup of a name can take long."""
         with self._lock:
             if self._connection is not None and self._connection.open:
                 return self._connection
             if time.monotonic() - self._failed_at < RETRY_SECONDS:
                 raise Unavailable(self._failure)
-            try:
-                self._connection = self._dial()
-            except SwitchboardError as error:
-                self._failed_at, self._failure = time.monotonic(), str(error)
-                raise Unavailable(self._failure) from None
-            return self._connection
+            dialled = self._dialled
+            if dialled is None:
+                dialled = self._dialled = Future()
+                threading.Thread(target=self._dial, args=(dialled,), name="dial the relay", daemon=True).start()
+        try:
+            return dialled.result(max(0.0, seconds))
+        except FutureTimeout:
+            raise Unavailable(f"the relay can't be reached in {seconds:g} s") from None
+        except SwitchboardError as error:
+            raise Unavailable(str(error)) from None
 
-    def _dial(self) -> FunctionConnection:
+    def _dial(self, dialled: Future[FunctionConnection]) -> None:
+        connection: FunctionConnection | None = None
+        try:
+            connection = self._connect()
+        except Exception as error:
+            failure = error
+        with self._lock:
+            wanted = self._dialled is dialled
+            if wanted:
+                self._dialled = None
+            if wanted and connection is not None:
+                self._connection = connection
+            elif wanted:
+                self._failed_at, self._failure = time.monotonic(), str(failure)
+        if connection is None:
+            dialled.set_exception(failure)
+            return
+        if not wanted:
+            connection.close(_CLOSED)
+        dialled.set_result(connection)
+
+    def _connect(self) -> FunctionConnection:
         folder = self._folder or state_folder()
         if folder is None:
             raise Unavailable("set SWITCHBOARD_ROBOT_STATE to the robot's state folder")

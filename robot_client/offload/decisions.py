@@ -72,7 +72,7 @@ class Offloaded(Generic[P, R]):
         when: Callable[[Device], bool] | None = None,
         fallback: bool = True,
         timeout: float = CALL_SECONDS,
-        newest: bool = False,
+        newest: bool | str = False,
         version: int | None = None,
         client: Cloud = cloud,
         state: Device = device,
@@ -178,7 +178,7 @@ def offload(
     when: Callable[[Device], bool] | None = None,
     fallback: bool = True,
     timeout: float = CALL_SECONDS,
-    newest: bool = False,
+    newest: bool | str = False,
     version: int | None = None,
     client: Cloud = cloud,
     state: Device = device,
@@ -191,7 +191,7 @@ def offload(
     :param fallback: whether it runs here when the relay can't be reached; also after a lost answer, if it is
         declared repeatable
     :param timeout: seconds for a call in the cloud
-    :param newest: of calls that wait for an earlier one in the cloud only the newest is sent
+    :param newest: of calls that wait for an earlier one in the cloud only the newest is sent; see :meth:`Cloud.call`
     """
 
     def wrap(local: Callable[P, R]) -> Offloaded[P, R]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import socket
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,7 +17,8 @@ from relay_protocol.function_link import FunctionReply
 from relay_protocol.functions import CallFailed
 from robot_client.offload import function_link, offload
 from robot_client.offload.cloud import Cloud, result_of
-from robot_client.offload.function_link import FunctionConnection
+from robot_client.offload.function_link import FunctionConnection, Overtaken
+from tests.worlds.waiting import wait_for
 
 
 @pytest.mark.parametrize(
@@ -81,7 +84,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cloud, socket.socket
     enrolment, identity = cast(Any, SimpleNamespace(address="relay")), cast(Any, None)
     connection = FunctionConnection(enrolment, identity)
     client = Cloud()
-    monkeypatch.setattr(client, "_dial", lambda: connection)
+    monkeypatch.setattr(client, "_connect", lambda: connection)
     yield client, other
     connection.close("over")
     other.close()
@@ -102,6 +105,67 @@ def test_a_call_that_was_not_sent_in_time_has_not_run(slow: tuple[Cloud, socket.
     with pytest.raises(Unavailable, match="bytes of calls wait for the slow link"):
         for _ in range(10):
             client.submit("look", frame=bytes(1_000_000))
+
+
+def test_a_call_does_not_wait_longer_for_the_link_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The relay's name is looked up for ever. All callers wait for one attempt, each as long as it may."""
+    client, looked_up, attempts = Cloud(), threading.Event(), list[str]()
+
+    def connect() -> FunctionConnection:
+        attempts.append("")
+        assert looked_up.wait(60)
+        raise Unavailable("there is no such relay")
+
+    monkeypatch.setattr(client, "_connect", connect)
+    with ThreadPoolExecutor(2) as pool:
+        patient = pool.submit(client.call, "look", timeout=60)
+        for _ in range(3):
+            with pytest.raises(Unavailable, match=r"can't be reached in 0\.1 s"):
+                client.call("look", timeout=0.1)
+        looked_up.set()
+        with pytest.raises(Unavailable, match="no such relay"):
+            patient.result(60)
+    assert len(attempts) == 1
+    with pytest.raises(Unavailable, match="no such relay"):
+        client.call("look", timeout=60)
+    assert len(attempts) == 1
+
+
+def test_a_link_that_is_closed_while_it_is_dialled_stays_closed(slow: tuple[Cloud, socket.socket]) -> None:
+    client, _ = slow
+    connect, go_on = client._connect, threading.Event()
+
+    def later() -> FunctionConnection:
+        assert go_on.wait(60)
+        return connect()
+
+    client._connect = later  # type: ignore[method-assign]
+    with ThreadPoolExecutor(1) as pool:
+        call = pool.submit(client.call, "look", timeout=60)
+        wait_for("it is dialled", lambda: client._dialled is not None)
+        client.close()
+        go_on.set()
+        with pytest.raises(Unavailable, match="the program has closed the link"):
+            call.result(60)
+    assert client._connection is None
+
+
+def test_calls_of_two_cameras_do_not_replace_each_other(slow: tuple[Cloud, socket.socket]) -> None:
+    client, _ = slow
+    frame = bytes(1_000_000)
+    with ThreadPoolExecutor(4) as pool:
+        first = pool.submit(client.call, "look", timeout=1, newest="front", frame=frame)
+        wait_for("the first is being sent", lambda: client._connection and client._connection._replies)
+        front = pool.submit(client.call, "look", timeout=1, newest="front", frame=frame)
+        wait_for("the second waits", lambda: client._connection and client._connection._waiting)
+        rear = pool.submit(client.call, "look", timeout=1, newest="rear", frame=frame)
+        wait_for("both wait", lambda: client._connection and len(client._connection._waiting) == 2)
+        newer = pool.submit(client.call, "look", timeout=1, newest="front", frame=frame)
+        with pytest.raises(Overtaken):
+            front.result(60)
+        for each in (first, rear, newer):
+            with pytest.raises((CallFailed, Unavailable)):
+                each.result(60)
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, 86_401.0, math.nan])
