@@ -24,6 +24,7 @@ from relay_server.offload.runner import (
     WorkerCall,
     WorkerFunctions,
     describe_functions,
+    end_groups,
     run_call,
     start_process,
 )
@@ -66,6 +67,7 @@ class CallProcesses:
         if pool is not None:
             pool.stop()
             pool.join()
+            end_groups(self._sockets)
         shutil.rmtree(self._sockets, ignore_errors=True)
 
     def _schedule(

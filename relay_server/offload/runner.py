@@ -1,6 +1,8 @@
 """The worker's side of a call: finds the function, runs it within its limits, and puts every end into words.
 
-It runs in the processes of :mod:`relay_server.offload.call_processes`. A process runs one call at a time.
+It runs in the processes of :mod:`relay_server.offload.call_processes`. A process runs one call at a time. What a
+function has started itself ends with its call: at its end as a child of the process, and if the process was killed as a
+member of its group.
 """
 
 from __future__ import annotations
@@ -42,6 +44,13 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Calls run side by side in processes, so libraries begin no threads of their own."""
 
 _PR_SET_PDEATHSIG = 1
+_PR_SET_CHILD_SUBREAPER = 36
+
+GROUP = "group-"
+"""Files beside the progress socket have this and the number of a process, which leads a group."""
+
+CHILD_SECONDS = 1.0
+"""Longest time in which the children of a call are ended."""
 
 
 class WorkerCall(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,7 +114,13 @@ def start_process(folder: str, progress_socket: str) -> None:
     :param progress_socket: path of its owner's datagram socket
     """
     global _socket
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    libc = ctypes.CDLL(None)
+    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
+    folder_of_groups = Path(progress_socket).parent
+    end_groups(folder_of_groups)
+    os.setpgid(0, 0)
+    (folder_of_groups / f"{GROUP}{os.getpid()}").touch()
     for name in ONE_THREAD:
         os.environ.setdefault(name, "1")
     _socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -113,6 +128,42 @@ def start_process(folder: str, progress_socket: str) -> None:
     with suppress(OSError):
         _socket.connect(progress_socket)
     registry(folder)
+
+
+def end_groups(folder: Path) -> None:
+    """Kill what is left of the groups of processes that have ended.
+
+    :param folder: of the progress socket
+    """
+    for each in folder.glob(f"{GROUP}*"):
+        leader = int(each.name.removeprefix(GROUP))
+        # While the leader lives, or the number is another process's, the group is none of ours to kill.
+        if not Path(f"/proc/{leader}").exists():
+            with suppress(OSError):
+                os.killpg(leader, signal.SIGKILL)
+            each.unlink(missing_ok=True)
+
+
+def _end_children() -> None:
+    """Kill what a call has started and left behind. Orphans of its children become children of this process."""
+    end = time.monotonic() + CHILD_SECONDS
+    while _has_children() and time.monotonic() < end:
+        for thread in Path("/proc/self/task").iterdir():
+            with suppress(OSError):
+                for child in (thread / "children").read_text().split():
+                    os.kill(int(child), signal.SIGKILL)
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        time.sleep(0.001)
+
+
+def _has_children() -> bool:
+    try:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return False
+    return True
 
 
 def registry(folder: str = "") -> FunctionRegistry:
@@ -140,6 +191,7 @@ def run_call(body: bytes) -> bytes:
     call = msgspec.msgpack.decode(body, type=WorkerCall)
     began = time.monotonic()
     outcome = _run(call, _to_socket(call.number))
+    _end_children()
     return msgspec.msgpack.encode(msgspec.structs.replace(outcome, seconds=time.monotonic() - began))
 
 

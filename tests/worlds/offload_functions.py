@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,22 @@ def report(steps: int, go_on: str) -> int:
     while not Path(go_on).exists():
         time.sleep(0.01)
     return steps
+
+
+@function(seconds=30.0)
+def leave_child(number: str, forever: bool = False) -> int:
+    """Starts a process that goes on in a session of its own, and writes down the number of its child's.
+
+    :param number: path of a file
+    """
+    pending = f"{number}.pending"
+    script = f"sleep 600 & echo $! > '{pending}'; mv '{pending}' '{number}'; wait"
+    subprocess.Popen(["sh", "-c", script], start_new_session=not forever)
+    while not Path(number).exists():
+        time.sleep(0.01)
+    while forever:
+        time.sleep(0.01)
+    return int(Path(number).read_text())
 
 
 @function(labels={"GPU": 1.0})

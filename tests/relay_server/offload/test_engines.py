@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -120,6 +121,22 @@ def test_a_call_without_a_result_ends_with_a_reason_and_disturbs_no_other(
     assert (outcome.value, outcome.code) == (None, code)
     assert words in outcome.error
     assert value((yield beside)) == 0.3
+    assert value((yield bench.outcome("add", a=1))) == 2
+
+
+@pytest_twisted.inlineCallbacks
+def test_what_a_function_has_started_ends_with_its_call(bench: Bench, tmp_path: Path) -> Any:
+    """Also what has left the group of its process; and when the call is killed, what has not."""
+    number = value((yield bench.outcome("leave_child", number=str(tmp_path / "left"))))
+    assert not Path(f"/proc/{number}").exists()
+    file = tmp_path / "killed"
+    outcome = yield bench.outcome("leave_child", number=str(file), forever=True, seconds=2.0)
+    assert outcome.code == "timeout"
+    number = int(file.read_text())
+    end = time.monotonic() + 60
+    while Path(f"/proc/{number}").exists():
+        assert time.monotonic() < end
+        yield deferLater(reactor, 0.05)
     assert value((yield bench.outcome("add", a=1))) == 2
 
 
