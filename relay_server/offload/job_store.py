@@ -56,13 +56,16 @@ class JobStore:
         """
         record = record_of_job(job, key)._replace(relay=self._relay)
         earlier = await self._database.write(_add, record)
-        if earlier is None:
-            job.stored = True
-        elif earlier.digest != record.digest:
-            raise KeyInUse(
-                "this key was sent with another function, version, robot or other arguments; use a new key"
-            )
-        return earlier
+        job.stored = earlier is None
+        return _same_call(earlier, record)
+
+    async def earlier(self, job: Job, key: str) -> FunctionJobRecord | None:
+        """The job that the owner has begun with this key before.
+
+        :raises KeyInUse: the key was used for another call
+        """
+        record = record_of_job(job, key)
+        return _same_call(await self._database.read(queries.job_of_key, record), record)
 
     async def update(self, job_id: str, **values: Any) -> None:
         """Set columns of a job."""
@@ -116,14 +119,26 @@ class JobStore:
         await self._database.write(queries.purge_jobs, now)
 
 
+def _same_call(earlier: FunctionJobRecord | None, record: FunctionJobRecord) -> FunctionJobRecord | None:
+    if earlier is not None and earlier.digest != record.digest:
+        raise KeyInUse(
+            "this key was sent with another function, version, robot or other arguments; use a new key"
+        )
+    return earlier
+
+
 def _add(s: Session, record: FunctionJobRecord) -> FunctionJobRecord | None:
+    earlier = queries.job_of_key(s, record)
+    if earlier is not None:
+        return earlier
     count, size = queries.stored_jobs(s, record.user_id, record.robot_id)
     if count >= MAX_STORED or size >= MAX_STORED_BYTES:
         raise TooManyJobs(
             f"{count} jobs of {record.owner} with {size} bytes of results are stored, the most there may be; fetch or "
             "remove some"
         )
-    return queries.store_job(s, record)
+    queries.store_job(s, record)
+    return None
 
 
 def record_of_job(job: Job, key: str | None) -> FunctionJobRecord:

@@ -356,6 +356,10 @@ class FunctionService:
             deadline=now + (deadline or max(KEPT_DEADLINE if keep else DEADLINE_SECONDS, function.seconds)),
             payer=payer,
         )
+        # A repeated call begins nothing, so it needs no room.
+        earlier = None if key is None else await self._store.earlier(job, key)
+        if earlier is not None:
+            return self._begun_before(earlier, function)
         self._require_room(job)
         if not keep and key is None:
             self._admit(job)
@@ -370,11 +374,14 @@ class FunctionService:
         finally:
             del self._admitting[job.id]
         if earlier is not None:
-            known = self._jobs.get(earlier.id) or self._admitting.get(earlier.id)
-            return known or restored_job(earlier, job.function)
+            return self._begun_before(earlier, job.function)
         if not self._closed:
             self._admit(job)
         return job
+
+    def _begun_before(self, record: FunctionJobRecord, function: FunctionDescription) -> Job:
+        known = self._jobs.get(record.id) or self._admitting.get(record.id)
+        return known or restored_job(record, function)
 
     async def keep(self, job: Job) -> None:
         """Store a job, since its caller waits no longer.

@@ -79,6 +79,7 @@ from relay_db.queries.files import (
 from relay_db.queries.function_jobs import (
     claim_unfinished_jobs,
     get_job,
+    job_of_key,
     list_jobs,
     purge_jobs,
     remove_job,
@@ -377,6 +378,7 @@ __all__ = [
     "get_alert",
     "get_entry",
     "get_job",
+    "job_of_key",
     "get_right",
     "get_user",
     "grant_right",

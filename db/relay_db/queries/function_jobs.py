@@ -19,22 +19,24 @@ MAX_LISTED = 200
 _UNFINISHED = ("queued", "running")
 
 
-def store_job(s: Session, job: FunctionJobRecord) -> FunctionJobRecord | None:
-    """Store a new job; if its owner has a job of the same key, return that instead.
+def job_of_key(s: Session, job: FunctionJobRecord) -> FunctionJobRecord | None:
+    """The job that the owner of a job has stored with the same key before."""
+    if job.key is None:
+        return None
+    return _job_where(s, _owner_is(job.user_id, job.robot_id), FunctionJob.key == job.key)
+
+
+def store_job(s: Session, job: FunctionJobRecord) -> None:
+    """Store a new job.
 
     :raises NotFound: its realm was removed
     """
-    if job.key is not None:
-        found = _job_where(s, _owner_is(job.user_id, job.robot_id), FunctionJob.key == job.key)
-        if found is not None:
-            return found
     realm_id = s.scalar(select(Realm.id).where(Realm.name == job.realm))
     if realm_id is None:
         raise NotFound("there is no such realm")
     values = {**job._asdict(), "realm_id": realm_id}
     del values["realm"], values["owner"], values["payer"]
     s.execute(insert(FunctionJob).values(**values))
-    return None
 
 
 def update_job(s: Session, /, job_id: str, **values: Any) -> None:

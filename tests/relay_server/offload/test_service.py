@@ -16,6 +16,7 @@ from relay_protocol.frames import FrameDecoder, SampleFrame
 from relay_protocol.function_link import FUNCTION_FRAME, CallFunction, decode_reply
 from relay_protocol.scopes import Scope
 from relay_server.http.limits import ConnectionLimits
+from relay_server.offload import job_store
 from relay_server.offload import service as module
 from relay_server.offload.job_store import KeyInUse, TooManyJobs
 from relay_server.offload.jobs import JobOwner
@@ -315,6 +316,18 @@ def test_a_token_for_another_robot_reaches_no_job(world: FunctionWorld) -> None:
     limited = dataclasses.replace(world.ann, robot_id=world.robot_id + 1)
     with pytest.raises(NotFound):
         result(Deferred.fromCoroutine(world.service.require_reach(limited, job)))
+
+
+@pytest.mark.parametrize("limit", [(module, "MAX_OF_OWNER"), (job_store, "MAX_STORED")])
+def test_a_call_is_repeated_though_a_quota_is_used_up(
+    world: FunctionWorld, monkeypatch: pytest.MonkeyPatch, limit: tuple[Any, str]
+) -> None:
+    """Else the caller would learn that it may not begin what it has begun."""
+    job = user_job(world, key="k")
+    monkeypatch.setattr(*limit, 1)
+    assert user_job(world, key="k").id == job.id
+    with pytest.raises(TooManyJobs):
+        user_job(world, key="other")
 
 
 @pytest.mark.parametrize("other", [{"version": 1}, {"robot": "rover"}])
