@@ -100,6 +100,7 @@ class DaemonProcess:
             DeviceReadings(modules.parent, self.platform.battery),
             modules.parent,
             send=connection.send,
+            publish=self.platform.publish_device,
             alert=self._alert,
         )
         requests = ModuleRequests(

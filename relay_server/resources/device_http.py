@@ -14,7 +14,7 @@ class DeviceInfo(msgspec.Struct, frozen=True, kw_only=True):
 
     :param at: when it was measured, Unix time at the robot, seconds
     :param readings: by component: `battery`, `cpu`, `memory` and `disk` in per cent, `temperature` in degrees Celsius,
-        `signal` in dBm; what can't be read is left out
+        `signal` (wireless) in dBm and its `quality`; what can't be read is left out
     :param critical: whether each component is critical
     """
 

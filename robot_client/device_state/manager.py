@@ -1,7 +1,7 @@
 """The device manager: measures the device once a cycle, and says which components are critical.
 
 Programs on the robot read that from ``device.json`` in the daemon's state folder, which is replaced as a whole. The
-relay gets it as a message, and people as alerts.
+relay gets it as a message, programs of the robot's graph as a topic, and people as alerts.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ class DeviceManager:
 
     :param folder: the daemon's state folder
     :param send: sends a message to the relay, if the robot is registered
+    :param publish: publishes the state in the robot's graph
     :param wall: Unix time in seconds
     """
 
@@ -41,6 +42,7 @@ class DeviceManager:
         folder: Path,
         *,
         send: Callable[[link.Message], None],
+        publish: Callable[[link.DeviceReport], None],
         alert: OnAlert,
         wall: Callable[[], float] = time.time,
     ) -> None:
@@ -50,6 +52,7 @@ class DeviceManager:
         self._where = settings.where
         self._folder = folder
         self._send = send
+        self._publish = publish
         self._wall = wall
         self._registered = False
         self._state: link.DeviceReport | None = None
@@ -81,6 +84,7 @@ class DeviceManager:
             self._send(self._state)
         for component, is_critical in critical.items():
             self._update_alert(component, is_critical, readings.get(component))
+        self._publish(self._state)
 
     def _update_alert(self, component: str, is_critical: bool, value: float | None) -> None:
         condition = self._alerts[component]
@@ -91,7 +95,8 @@ class DeviceManager:
         text = ""
         if is_critical and value is not None:
             side = "at or below" if rule.too_low else "at or above"
-            text = f"{component} is critical: {value:g} {rule.unit}, {side} {limit:g} {rule.unit}"
+            unit = f" {rule.unit}" if rule.unit else ""
+            text = f"{component} is critical: {value:g}{unit}, {side} {limit:g}{unit}"
         condition.update(text, f"{component} is not critical any more")
 
     def _write_state(self, state: link.DeviceReport) -> None:

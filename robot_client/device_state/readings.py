@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from robot_client.device_state.rules import BATTERY, CPU, DISK, MEMORY, SIGNAL, TEMPERATURE
+from robot_client.device_state.rules import BATTERY, CPU, DISK, MEMORY, QUALITY, SIGNAL, TEMPERATURE
 
 
 class DeviceReadings:
@@ -25,8 +25,10 @@ class DeviceReadings:
 
     def read(self) -> dict[str, float]:
         """The readings by component: per cent, degrees Celsius, dBm. The CPU's load is since the call before."""
+        signal, quality = self._wireless()
         found: dict[str, float | None] = {
-            SIGNAL: self._signal(),
+            SIGNAL: signal,
+            QUALITY: quality,
             BATTERY: self._charge(),
             CPU: self._cpu(),
             MEMORY: self._memory(),
@@ -35,16 +37,18 @@ class DeviceReadings:
         }
         return {name: round(value, 1) for name, value in found.items() if value is not None}
 
-    def _signal(self) -> float | None:
-        """The best signal of the wireless interfaces (proc(5), ``/proc/net/wireless``)."""
-        levels = []
+    def _wireless(self) -> tuple[float | None, float | None]:
+        """Signal and quality of the wireless interface with the best signal (proc(5), ``/proc/net/wireless``)."""
+        found = []
         for line in self._text("proc/net/wireless").splitlines()[2:]:
             fields = line.split()
             try:
-                levels.append(float(fields[3].rstrip(".")))
-            except (IndexError, ValueError):
+                quality, level = (float(each.rstrip(".")) for each in fields[2:4])
+            except ValueError:
                 continue
-        return max((each for each in levels if -200 <= each < 0), default=None)
+            if -200 <= level < 0:
+                found.append((level, quality))
+        return max(found, default=(None, None))
 
     def _charge(self) -> float | None:
         charge = self._battery()

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from robot_client.device_state.settings import DeviceSettings
 
 SIGNAL = "signal"
+QUALITY = "quality"
 BATTERY = "battery"
 CPU = "cpu"
 MEMORY = "memory"
@@ -31,6 +32,7 @@ class Rule(NamedTuple):
 
 RULES = {
     SIGNAL: Rule(True, "dBm"),
+    QUALITY: Rule(True, ""),
     BATTERY: Rule(True, "%"),
     CPU: Rule(False, "%"),
     MEMORY: Rule(False, "%"),
@@ -38,6 +40,9 @@ RULES = {
     TEMPERATURE: Rule(False, "°C"),
 }
 """The components, in the order in which they are checked."""
+
+WIRELESS = (SIGNAL, QUALITY)
+"""Components of which a critical one means that the network can't help."""
 
 
 class CriticalComponents:
@@ -53,14 +58,14 @@ class CriticalComponents:
 
         :param readings: by component; percent, degrees Celsius, dBm
         """
-        poor = self._exceeded(SIGNAL, readings)
-        self._critical[SIGNAL] = poor
-        if poor:
+        for component in WIRELESS:
+            self._critical[component] = self._exceeded(component, readings)
+        if any(self._critical[each] for each in WIRELESS):
             # The others keep what was found before; readings in a row begin again.
             self._cpu_high = 0
             return dict(self._critical)
         for component in RULES:
-            if component not in (SIGNAL, CPU):
+            if component not in (*WIRELESS, CPU):
                 self._critical[component] = self._exceeded(component, readings)
         self._cpu_high = self._cpu_high + 1 if self._exceeded(CPU, readings) else 0
         self._critical[CPU] = self._cpu_high >= self._settings.cpu_in_a_row

@@ -18,6 +18,7 @@ class CriticalValues(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     :param disk: in use at or above this, per cent, of the disk with the daemon's state folder
     :param temperature: of the hottest sensor at or above this, degrees Celsius
     :param signal: of the wireless link at or below this, dBm
+    :param quality: of the wireless link at or below this, in its driver's scale, which often ends at 70
     """
 
     battery: Percent | None = 20.0
@@ -26,6 +27,7 @@ class CriticalValues(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     disk: Percent | None = 90.0
     temperature: Annotated[float, msgspec.Meta(ge=-50, le=200)] | None = 85.0
     signal: Annotated[float, msgspec.Meta(ge=-200, le=0)] | None = -80.0
+    quality: Annotated[float, msgspec.Meta(ge=0, le=255)] | None = None
 
 
 class DeviceSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

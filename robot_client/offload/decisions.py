@@ -13,7 +13,7 @@ from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_protocol.functions import spec_of
 from robot_client.offload.cloud import CALL_SECONDS, Cloud, cloud
-from robot_client.offload.device import SIGNAL, Device, Where, device
+from robot_client.offload.device import WIRELESS, Device, Where, device
 from robot_client.offload.function_link import Overtaken
 
 P = ParamSpec("P")
@@ -153,7 +153,7 @@ class Offloaded(Generic[P, R]):
         wanted = self._device.where()
         if wanted != "auto":
             return wanted, "as the robot's settings say"
-        if self._device.critical(SIGNAL):
+        if any(map(self._device.critical, WIRELESS)):
             return "here", "the signal is too weak"
         critical = [each for each in LOADED if self._device.critical(each)]
         if critical:

@@ -19,8 +19,8 @@ MAX_AGE = 180.0
 STATE_VARIABLE = "SWITCHBOARD_ROBOT_STATE"
 """Environment variable with the robot's state folder."""
 
-SIGNAL = "signal"
-"""The component whose critical value means that the network is too bad to offload."""
+WIRELESS = ("signal", "quality")
+"""Components of which a critical value means that the network is too bad to offload."""
 
 
 Where = Literal["auto", "here", "cloud"]
@@ -31,7 +31,7 @@ class DeviceState(msgspec.Struct, frozen=True):
     """The state that the device manager publishes once a cycle.
 
     :param at: Unix seconds
-    :param critical: by component: ``battery``, ``cpu``, ``memory``, ``disk``, ``temperature``, ``signal``
+    :param critical: by component: ``battery``, ``cpu``, ``memory``, ``disk``, ``temperature``, ``signal``, ``quality``
     :param readings: by component, in its unit
     :param where: where the robot's settings want functions to run
     """

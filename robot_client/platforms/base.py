@@ -317,6 +317,9 @@ class Platform(Protocol):
     def battery(self) -> float | None:
         """Charge, 0 to 1; ``None`` if unknown."""
 
+    def publish_device(self, state: link.DeviceReport) -> None:
+        """Publish the state of the robot's computer in its graph, if programs there can read it."""
+
     def fault(self) -> str | None:
         """A sentence that says why the middleware no longer works; ``None``: it works."""
 

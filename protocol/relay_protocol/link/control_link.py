@@ -123,7 +123,7 @@ class DeviceReport(Message, frozen=True, kw_only=True):
 
     :param at: Unix time at the robot, seconds
     :param readings: by component: ``battery``, ``cpu``, ``memory`` and ``disk`` in per cent, ``temperature`` in degrees
-        Celsius, ``signal`` (wireless) in dBm; what can't be read is left out
+        Celsius, ``signal`` (wireless) in dBm, and its ``quality``; what can't be read is left out
     :param critical: whether each component is critical, by the robot's settings
     """
 

@@ -13,6 +13,8 @@ from relay_protocol.errors import Unavailable
 from robot_client.platforms.ros2.executor import Spinner, make_executor
 from robot_client.platforms.ros2.transport import without_shared_memory
 
+_DEVICE = "device_"
+"""Prefix of the name of the node of the computer: names that begin as the daemon's own are hidden from the graph."""
 _ACTIONS = "_actions"
 """Suffix of the name of the node for actions."""
 
@@ -33,6 +35,7 @@ class Nodes:
         self._sim_time = sim_time
         self._context: Any = None
         self._for_actions: Spinner | None = None
+        self._for_device: Any = None
 
     def start(self) -> None:
         """Create the node; its executor does not spin yet.
@@ -62,6 +65,12 @@ class Nodes:
             self._for_actions.start()
         return self._for_actions
 
+    def for_device(self) -> Any:
+        """The node of the robot's computer, created on first use. It only publishes, so nothing serves it."""
+        if self._for_device is None:
+            self._for_device = self._create_node(_DEVICE + self.names[0])
+        return self._for_device
+
     def fault(self) -> str | None:
         """See :meth:`~robot_client.platforms.ros2.executor.Spinner.fault`, of either executor."""
         fault = self.main.fault()
@@ -79,17 +88,22 @@ class Nodes:
 
     def destroy(self) -> None:
         """Leave the graph."""
+        device, self._for_device = self._for_device, None
+        if device is not None:
+            device.destroy_node()
         self.main.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
     def _create(self, name: str, executor: str) -> Spinner:
-        node = rclpy.create_node(
+        # A steady clock: the node's clock stops when a simulation pauses.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        return Spinner(make_executor(executor, self._context), self._create_node(name), steady)
+
+    def _create_node(self, name: str) -> Any:
+        return rclpy.create_node(
             name,
             context=self._context,
             start_parameter_services=False,
             enable_rosout=False,
             parameter_overrides=[Parameter("use_sim_time", value=self._sim_time)],
         )
-        # A steady clock: the node's clock stops when a simulation pauses.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        return Spinner(make_executor(executor, self._context), node, steady)

@@ -34,6 +34,7 @@ from robot_client.platforms.base import (
     Platform,
 )
 from robot_client.platforms.ros2 import graph
+from robot_client.platforms.ros2.device_topic import DeviceTopic
 from robot_client.platforms.ros2.errors import refusals
 from robot_client.platforms.ros2.executor import ReactorBridge
 from robot_client.platforms.ros2.goals import RosGoal, RosGoals
@@ -118,6 +119,8 @@ class Ros2Platform(Platform):
             else None
         )
         self._node: Any = None
+        self._device_topic: DeviceTopic | None = None
+        self._device_state: link.DeviceReport | None = None
 
     @property
     def dropped(self) -> int:
@@ -141,6 +144,7 @@ class Ros2Platform(Platform):
         if self._node is None:
             return
         self._calls.close()
+        self._device_topic = None
         for subscription in list(self._subscriptions):
             subscription.close()
         for publisher in list(self._publishers):
@@ -172,6 +176,8 @@ class Ros2Platform(Platform):
         for reader in (self._battery, self._diagnostics):
             if reader is not None:
                 reader.subscribe_again()
+        if self._device_state is not None:
+            self.publish_device(self._device_state)
 
     def facts(self) -> Facts:
         return Facts(
@@ -358,6 +364,14 @@ class Ros2Platform(Platform):
 
     def battery(self) -> float | None:
         return None if self._battery is None else self._battery.charge()
+
+    def publish_device(self, state: link.DeviceReport) -> None:
+        self._device_state = state
+        if self._node is None:
+            return
+        if self._device_topic is None:
+            self._device_topic = DeviceTopic(self._nodes.for_device())
+        self._device_topic.publish(state)
 
     def fault(self) -> str | None:
         return self._nodes.fault() if self._node is not None else "the daemon has left the ROS graph"

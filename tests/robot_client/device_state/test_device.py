@@ -41,7 +41,7 @@ class Kernel:
         )
 
     def signal(self, *levels: str) -> None:
-        lines = [f" wlan{i}: 0000   60.  {level}  -256        0      0\n" for i, level in enumerate(levels)]
+        lines = [f" wlan{i}: 0000   {60 + i}.  {level}  -256        0      0\n" for i, level in enumerate(levels)]
         self.write("proc/net/wireless", HEAD + "".join(lines))
 
     def readings(self) -> DeviceReadings:
@@ -64,7 +64,8 @@ def test_readings_of_cpu_and_memory(kernel: Kernel) -> None:
 
 def test_the_best_wireless_signal_counts(kernel: Kernel) -> None:
     kernel.signal("-71.", "-52.", "0", "nonsense")
-    assert kernel.readings().read()["signal"] == -52.0
+    found = kernel.readings().read()
+    assert (found["signal"], found["quality"]) == (-52.0, 61.0)
 
 
 def test_the_hottest_sensor_counts(kernel: Kernel) -> None:
@@ -94,7 +95,15 @@ def test_what_can_not_be_read_is_left_out(tmp_path: Path) -> None:
     assert readings.read() == {}
 
 
-FINE = {"battery": 50.0, "cpu": 50.0, "memory": 50.0, "disk": 50.0, "temperature": 50.0, "signal": -50.0}
+FINE = {
+    "battery": 50.0,
+    "cpu": 50.0,
+    "memory": 50.0,
+    "disk": 50.0,
+    "temperature": 50.0,
+    "signal": -50.0,
+    "quality": 60.0,
+}
 
 
 @pytest.mark.parametrize(
@@ -150,6 +159,14 @@ def test_a_poor_signal_interrupts_readings_in_a_row() -> None:
     assert [rules.measured(busy)["cpu"] for _ in range(3)] == [False, False, True]
 
 
+def test_a_low_quality_counts_if_the_settings_say_so() -> None:
+    """Its scale is the driver's, so there is no value for all."""
+    poor = {**FINE, "quality": 9.0, "memory": 99.0}
+    assert CriticalComponents(DeviceSettings()).measured(poor)["quality"] is False
+    found = CriticalComponents(DeviceSettings(critical=CriticalValues(quality=10.0))).measured(poor)
+    assert found == {**dict.fromkeys(FINE, False), "quality": True}
+
+
 def test_a_component_without_a_reading_or_a_value_is_not_critical() -> None:
     never = DeviceSettings(critical=CriticalValues(memory=None))
     assert not any(CriticalComponents(never).measured({"memory": 100.0}).values())
@@ -158,12 +175,14 @@ def test_a_component_without_a_reading_or_a_value_is_not_critical() -> None:
 class Managed:
     def __init__(self, kernel: Kernel) -> None:
         self.sent: list[Any] = []
+        self.published: list[link.DeviceReport] = []
         self.alerts: list[tuple[str, str, bool]] = []
         self.manager = DeviceManager(
             DeviceSettings(),
             kernel.readings(),
             kernel.root,
             send=self.sent.append,
+            publish=self.published.append,
             alert=self.alert,
             wall=lambda: 1000.0,
         )
@@ -200,6 +219,7 @@ def test_pressure_reaches_the_file_the_relay_and_users(kernel: Kernel) -> None:
     made.manager.link_lost()
     made.manager.measure()
     assert len(made.sent) == 3
+    assert [each.readings["memory"] for each in made.published] == [95.0, 96.0, 10.0, 10.0]
 
 
 def test_state_folder_that_can_not_be_written_is_reported_until_it_can(kernel: Kernel) -> None:

@@ -16,6 +16,7 @@ const COMPONENTS: [string, string, string][] = [
   ['disk', 'Disk in use', '%'],
   ['temperature', 'Temperature', '°C'],
   ['signal', 'Wireless signal', 'dBm'],
+  ['quality', 'Wireless quality', ''],
 ]
 
 /** What was measured; components that can't be read are left out. */
@@ -23,7 +24,7 @@ export function readingsOf(device: DeviceInfo): Reading[] {
   return COMPONENTS.flatMap(([name, title, unit]) => {
     const value = device.readings[name]
     if (value === undefined) return []
-    const words = `${Math.round(value)} ${unit}`.replace('-', '−')
+    const words = `${Math.round(value)} ${unit}`.trim().replace('-', '−')
     return [{ name, title, words, critical: device.critical[name] === true }]
   })
 }
