@@ -280,7 +280,9 @@ def _foxglove_urls(core: Core, changes: ChangeWatcher, sessions: SessionManager)
 
 def _functions(core: Core, sessions: SessionManager) -> FunctionService:
     functions = build_functions(core)
-    sessions.relay_node.add_services(FunctionRosServices(functions).handlers())
+    function_services = FunctionRosServices(functions)
+    sessions.relay_node.add_services(function_services.handlers())
+    sessions.relay_node.add_actions(function_services.actions())
     return functions
 
 

@@ -173,6 +173,25 @@ class ClientGoal(ActionGoal):
             self._requester.ended(result.status, True, values)
 
 
+class OwnGoal(ActionGoal):
+    """A goal of a client for one of the relay's own actions; feedback and result are JSON."""
+
+    def __init__(self, requester: GoalRequester, action: str, wants_feedback: bool) -> None:
+        super().__init__(action, wants_feedback)
+        self._requester = requester
+
+    def send_feedback(self, body: bytes) -> None:
+        """Send feedback as it is."""
+        self._requester.feedback(body)
+
+    def send_result(self, result: GoalResult) -> None:
+        """Send the result as it is, or the reason why there is none."""
+        if result.body is None:
+            self._requester.ended(result.status, False, jsontext.encode(result.reason))
+        else:
+            self._requester.ended(result.status, True, result.body)
+
+
 class GraphGoal(ActionGoal):
     """A goal of the robot's graph for an action that a client offers.
 

@@ -1,19 +1,21 @@
-"""``/relay/…`` services about functions."""
+"""``/relay/…`` services and actions about functions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
-from relay_protocol import jsontext
-from relay_protocol.errors import Invalid, MalformedMessage
+from relay_protocol import json_cost, jsontext
+from relay_protocol.errors import Invalid, MalformedMessage, SwitchboardError
+from relay_protocol.function_link import MAX_DEADLINE
 from relay_protocol.functions import FAULTS, to_json
+from relay_server.channels.goals import GoalResult, GoalStatusCode, OwnGoal
 from relay_server.offload.jobs import Job
 from relay_server.offload.service import FunctionService, job_owner
 from relay_server.relay_node.arguments import get_argument, text, whole_number
-from relay_server.sessions.context import ClientContext
+from relay_server.sessions.context import ClientContext, StartOwnGoal
 
 MAX_TIMEOUT = 60.0
 
@@ -31,6 +33,10 @@ class FunctionRosServices:
             "/relay/call_function": self.call,
             "/relay/function_job": self.job,
         }
+
+    def actions(self) -> dict[str, StartOwnGoal]:
+        """Actions by name."""
+        return {"/relay/run_function": self.run}
 
     async def functions(self, client: ClientContext, args: Any) -> Any:
         """``/relay/functions``"""
@@ -52,11 +58,7 @@ class FunctionRosServices:
         """``/relay/call_function``: ``arguments`` is JSON. It counts for the robot of the connection."""
         name, version = text(args, "function"), whole_number(args, "version", 2, 0)
         timeout = _seconds(args, "timeout", 3)
-        try:
-            given = jsontext.decode_any((text(args, "arguments", 1, "") or "{}").encode())
-            arguments = msgspec.msgpack.encode(given)
-        except (MalformedMessage, *FAULTS) as error:
-            raise Invalid(f"'arguments' can't be read: {error}") from None
+        arguments = _packed(text(args, "arguments", 1, ""))
         owner, payer = await self._service.user(client.permit.principal, name, client.robot.name)
         job = await self._service.submit(
             owner, name, arguments, version=version or None, payer=payer, keep=timeout <= 0
@@ -65,6 +67,32 @@ class FunctionRosServices:
         if not job.over:
             await self._service.keep(job)
         return _state(job)
+
+    async def run(self, client: ClientContext, args: bytes, goal: OwnGoal) -> None:
+        """``/relay/run_function``: a goal that ends with its job. It counts for the robot of the connection.
+
+        :raises SwitchboardError: it can't begin
+        """
+        with client.quota.counted():
+            json_cost.check(args)
+            try:
+                wanted = jsontext.decode(_GOAL, args or b"{}")
+            except MalformedMessage as error:
+                raise Invalid(f"a goal of /relay/run_function can't be read: {error}") from None
+            arguments = _packed(wanted.arguments)
+        owner, payer = await self._service.user(client.permit.principal, wanted.function, client.robot.name)
+        job = await self._service.submit(
+            owner,
+            wanted.function,
+            arguments,
+            version=wanted.version or None,
+            deadline=wanted.deadline or None,
+            payer=payer,
+        )
+        execution = _Execution(self._service, job, goal)
+        goal.executor = execution
+        job.on_progress = execution.progressed
+        job.wait().addCallback(execution.ended)
 
     async def job(self, client: ClientContext, args: Any) -> Any:
         """``/relay/function_job``"""
@@ -75,6 +103,77 @@ class FunctionRosServices:
             await self._service.remove(job)
         await self._service.wait(job, _seconds(args, "wait", 1))
         return {**_state(job), "progress": job.progress}
+
+
+class _FunctionGoal(msgspec.Struct, frozen=True):
+    """The arguments of a goal.
+
+    :param arguments: JSON text
+    :param version: 0: the newest
+    :param deadline: seconds; 0: as for a call without one
+    """
+
+    function: str
+    arguments: str = ""
+    version: Annotated[int, msgspec.Meta(ge=0)] = 0
+    deadline: Annotated[float, msgspec.Meta(ge=0, le=MAX_DEADLINE)] = 0.0
+
+
+_GOAL = msgspec.json.Decoder(_FunctionGoal)
+
+
+class _Execution:
+    """A job as the executor of a goal (:class:`relay_server.channels.goals.Executor`)."""
+
+    def __init__(self, service: FunctionService, job: Job, goal: OwnGoal) -> None:
+        self._service = service
+        self._job = job
+        self._goal = goal
+
+    def cancel(self) -> None:
+        """End the job."""
+        self._service.cancel(self._job)
+
+    def forget(self) -> None:
+        """The job has been cancelled before."""
+
+    def progressed(self) -> None:
+        """The function has reported its progress."""
+        job = self._job
+        self._goal.feedback_received(
+            jsontext.encode({"progress": job.progress, "text": job.text, "state": job.state})
+        )
+
+    def ended(self, _: None) -> None:
+        """The job has ended: with a result, or a reason why there is none."""
+        job = self._job
+        if job.state == "cancelled":
+            self._goal.end(GoalResult(GoalStatusCode.CANCELED, None, job.status().error))
+        elif job.state == "failed":
+            status = job.status()
+            self._goal.end(GoalResult(GoalStatusCode.ABORTED, None, f"{status.code}: {status.error}"))
+        else:
+            self._goal.end(self._result())
+
+    def _result(self) -> GoalResult:
+        try:
+            return GoalResult(GoalStatusCode.SUCCEEDED, jsontext.encode(_state(self._job)))
+        except SwitchboardError as error:
+            return GoalResult(GoalStatusCode.ABORTED, None, f"{error.code}: {error}")
+
+
+def _packed(arguments: str) -> bytes:
+    """Arguments of a function as MessagePack.
+
+    :param arguments: JSON text; empty for none
+    :raises Invalid: it can't be read
+    """
+    given = (arguments or "{}").encode()
+    try:
+        json_cost.check(given)
+        return msgspec.msgpack.encode(jsontext.decode_any(given))
+    except (MalformedMessage, *FAULTS) as error:
+        raise Invalid(f"'arguments' can't be read: {error}") from None
 
 
 def _seconds(args: Any, name: str, position: int) -> float:

@@ -409,6 +409,12 @@ float64 created
 uint64 memory
 """
 
+RUN_FUNCTION = "switchboard_msgs/action/RunFunction"
+_RUN_FUNCTION_TEXT = (
+    f"string function\nstring arguments\nuint32 version\nfloat64 deadline\n{_JOB}---\n"
+    "float64 progress\nstring text\nstring state\n"
+)
+
 TOPICS = {
     "/relay/control": CONTROL,
     "/relay/modules": MODULES,
@@ -419,6 +425,7 @@ TOPICS = {
 OWN_SERVICES = {
     name: Service(types=[offered.type], providers=[offered.node]) for name, offered in SERVICES.items()
 }
+OWN_ACTIONS = {"/relay/run_function": Service(types=[RUN_FUNCTION], providers=[RELAY])}
 OWN_TOPICS = {name: Topic(types=[type_name], publishers=[RELAY]) for name, type_name in TOPICS.items()}
 
 
@@ -429,6 +436,7 @@ def _registry() -> TypeRegistry:
     types.add(MODULES, _MODULES_TEXT)
     types.add(PROCESSES, _PROCESSES_TEXT)
     types.add(_TYPEDEF, _TYPEDEF_TEXT)
+    types.add(RUN_FUNCTION, _RUN_FUNCTION_TEXT)
     for offered in SERVICES.values():
         types.add(offered.type, offered.text)
     return types
@@ -437,4 +445,6 @@ def _registry() -> TypeRegistry:
 TYPES = _registry()
 """The definitions of all of these."""
 
-TYPE_NAMES = sorted({_TYPEDEF, *TOPICS.values(), *(offered.type for offered in SERVICES.values())})
+TYPE_NAMES = sorted(
+    {_TYPEDEF, RUN_FUNCTION, *TOPICS.values(), *(offered.type for offered in SERVICES.values())}
+)

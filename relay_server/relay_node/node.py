@@ -15,7 +15,7 @@ from relay_server.control.service import ControlService
 from relay_server.modules.service import ModuleService
 from relay_server.relay_node import control, modules, rosapi
 from relay_server.robots.link_quality import joined, milliseconds
-from relay_server.sessions.context import ClientContext
+from relay_server.sessions.context import ClientContext, StartOwnGoal
 from relay_server.sessions.presence import PresenceReader, PresenceService, client_rows
 from relay_server.sessions.rosbridge_port import slow_connection_advice
 from relay_server.video.stream import CameraStream
@@ -58,6 +58,7 @@ class RelayNode:
             **own_modules.handlers(),
             **rosapi.SERVICES,
         }
+        self._actions: dict[str, StartOwnGoal] = {}
         self._topics: dict[str, Callable[[ClientContext], dict[str, Any]]] = {
             "/relay/status": self.status,
             CONTROL: control.control_state,
@@ -73,6 +74,14 @@ class RelayNode:
     ) -> None:
         """Add services of a feature that itself needs sessions."""
         self._services.update(handlers)
+
+    def action(self, name: str) -> StartOwnGoal | None:
+        """The function that begins goals of an action that the relay itself offers."""
+        return self._actions.get(name)
+
+    def add_actions(self, handlers: dict[str, StartOwnGoal]) -> None:
+        """Add actions of a feature that itself needs sessions."""
+        self._actions.update(handlers)
 
     def topic(self, name: str) -> Callable[[ClientContext], dict[str, Any]] | None:
         """The function that makes the messages of a topic that the relay itself publishes."""

@@ -14,7 +14,7 @@ from relay_protocol import link
 from relay_protocol.link import Service, Topic
 from relay_protocol.rights import Operation, Rules
 from relay_server.access import may_subscribe
-from relay_server.relay_node.interfaces import OWN_SERVICES, OWN_TOPICS, RELAY, ROSAPI
+from relay_server.relay_node.interfaces import OWN_ACTIONS, OWN_SERVICES, OWN_TOPICS, RELAY, ROSAPI
 from relay_server.robots.registry import GraphMirror, OwnEndpoints, RobotState
 from relay_server.sessions.context import ClientContext
 
@@ -120,8 +120,9 @@ def _compute(robot: RobotState, ends: OwnEndpoints, rules: Rules) -> VisibleGrap
         for name, action in sorted(_services(graph.actions, ends.actions).items())
         if not hidden(name) and may_call(name)
     }
-    # The relay's own services are open to everyone with a right on the robot.
+    # The relay's own services and actions are open to everyone with a right on the robot.
     services = dict(sorted({**services, **OWN_SERVICES}.items()))
+    actions = dict(sorted({**actions, **OWN_ACTIONS}.items()))
     return VisibleGraph(topics, services, actions, sorted({*graph.nodes, RELAY, ROSAPI}), unlisted)
 
 

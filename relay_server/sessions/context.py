@@ -13,7 +13,7 @@ from relay_protocol.rights import Operation
 from relay_server.access import Permit
 from relay_server.channels.channel import Channel
 from relay_server.channels.client_subscription import ClientSubscription
-from relay_server.channels.goals import GoalStatusCode
+from relay_server.channels.goals import GoalStatusCode, OwnGoal
 from relay_server.channels.publications import RobotPublication
 from relay_server.channels.samples import Sample
 from relay_server.common.clock import Clock
@@ -260,11 +260,21 @@ class ClientContext:
         return self._clock.seconds() - ago / 1e9
 
 
+StartOwnGoal = Callable[["ClientContext", bytes, OwnGoal], Coroutine[Any, Any, None]]
+"""Begins a goal of one of the relay's own actions, and sets its executor.
+
+Its arguments are the client, the arguments of the goal as JSON, and the goal. It raises a
+:class:`relay_protocol.errors.SwitchboardError` if the goal can't begin."""
+
+
 class LocalNode(Protocol):
-    """The relay's own services and topics in every robot's graph (``/relay/…``, ``/rosapi/…``)."""
+    """The relay's own services, actions and topics in every robot's graph (``/relay/…``, ``/rosapi/…``)."""
 
     def service(self, name: str) -> Callable[[ClientContext, Any], Coroutine[Any, Any, Any]] | None:
         """The handler of one of the relay's own services."""
+
+    def action(self, name: str) -> StartOwnGoal | None:
+        """The function that begins goals of one of the relay's own actions."""
 
     def topic(self, name: str) -> Callable[[ClientContext], dict[str, Any]] | None:
         """The function that makes the messages of one of the relay's own topics."""

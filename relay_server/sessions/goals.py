@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import Logger
+from twisted.python.failure import Failure
 
 from relay_protocol import jsontext, rosbridge
-from relay_protocol.errors import Invalid, Refused
+from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
 from relay_server.channels.encodings import requested_encoding
-from relay_server.channels.goals import ClientGoal, GoalStatusCode
+from relay_server.channels.goals import ActionGoal, GoalStatusCode, OwnGoal, start_error
 from relay_server.channels.members import RequestContext
 from relay_server.channels.names import normal_type, resolve
-from relay_server.sessions.context import ClientContext
+from relay_server.sessions.context import ClientContext, LocalNode, StartOwnGoal
 from relay_server.sessions.motion_requests import MotionRequest
 
 GOALS = 64
@@ -32,7 +34,7 @@ class _Goal:
         self.operation = operation
         self.moves = moves
         self.size = len(bytes(operation.args or b""))
-        self.record: ClientGoal | None = None
+        self.record: ActionGoal | None = None
         self._handler = handler
 
     def feedback(self, values: bytes) -> None:
@@ -51,14 +53,19 @@ class _Goal:
 class ActionGoalHandler:
     """The goals of one session."""
 
-    def __init__(self, client: ClientContext) -> None:
+    log = Logger()
+
+    def __init__(self, client: ClientContext, local: LocalNode) -> None:
         self._client = client
+        self._local = local
         self._goals: list[_Goal] = []
 
     def send_goal(self, operation: rosbridge.SendActionGoal) -> None:
-        """Send a goal to the robot, or to the client that offers the action."""
+        """Send a goal to the robot, or to the client that offers the action, or begin one of the relay's own."""
         client, action = self._client, resolve(operation.action)
-        client.require(Operation.CALL, action)
+        own = self._local.action(action)
+        if own is None:
+            client.require(Operation.CALL, action)
         moves = client.robot.description.motion.moves_by_action(action)
         earliest_sent = client.earliest_sent
         args = bytes(operation.args or b"")
@@ -70,6 +77,9 @@ class ActionGoalHandler:
         self._goals.append(goal)
         client.motion.goals += moves
         client.activity("goal.begun", action=action, goal=operation.id)
+        if own is not None:
+            goal.record = self._begin_own(own, goal, action, args)
+            return
         goal.record = client.channel.requests.send_goal(
             client,
             goal,
@@ -79,6 +89,17 @@ class ActionGoalHandler:
             RequestContext(client.number, earliest_sent, motion_request),
             feedback=operation.feedback,
         )
+
+    def _begin_own(self, own: StartOwnGoal, goal: _Goal, action: str, args: bytes) -> OwnGoal:
+        record = OwnGoal(goal, action, goal.operation.feedback)
+        record.starting = Deferred.fromCoroutine(own(self._client, args, record))
+        record.starting.addErrback(self._own_failed, record)
+        return record
+
+    def _own_failed(self, failure: Failure, goal: OwnGoal) -> None:
+        goal.end(start_error(failure, goal.action))
+        if not failure.check(SwitchboardError, CancelledError):
+            self.log.failure("a goal of {action} failed", failure, action=goal.action)
 
     def begun(self, id: rosbridge.Id) -> Deferred[None]:
         """Fires when a goal was sent to the robot or client that executes it, or has ended."""
@@ -107,8 +128,10 @@ class ActionGoalHandler:
         raise Invalid(f"no goal of yours with the id '{str(operation.id)[:80]}' is under way")
 
     def rights_changed(self) -> None:
-        """Cancel goals for which the client has no right any more; they end at once."""
+        """Cancel goals for which the client has no right any more; they end at once. The relay's own go on."""
         for goal in list(self._goals):
+            if isinstance(goal.record, OwnGoal):
+                continue
             decision = self._client.permit.decide(Operation.CALL, resolve(goal.operation.action))
             if not decision.allowed and goal.record is not None:
                 goal.record.abandon()
@@ -133,9 +156,11 @@ class ActionGoalHandler:
         self._client.port.action_result(goal.operation, status, result, values)
 
     def end(self) -> None:
-        """The client is gone; the channel cancels its goals."""
+        """The client is gone; the channel cancels its goals, but for the relay's own."""
         for goal in self._goals:
             self._notice_end(goal, GoalStatusCode.CANCELED)
+            if isinstance(goal.record, OwnGoal):
+                goal.record.abandon()
 
     def _notice_end(self, goal: _Goal, status: int) -> None:
         self._client.activity(

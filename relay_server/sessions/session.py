@@ -61,7 +61,7 @@ class Session:
         self.subscriptions = SubscriptionHandler(client, clock, local, timers)
         self.publish_handler = PublishHandler(client)
         self.service_calls = ServiceCallHandler(client, local)
-        self.goals = ActionGoalHandler(client)
+        self.goals = ActionGoalHandler(client, local)
         self.offered_services = OfferedServiceHandler(client)
         client.close = client.quota.close = self.close
         client.recheck_rights = self.subscriptions.recheck_rights

@@ -348,6 +348,7 @@ def _thing(robot: _Readable) -> RobotThing:
     actions = [
         ThingOperation(name, _first(action.types), motion.moves_by_action(name))
         for name, action in graph.actions.items()
+        if name not in interfaces.OWN_ACTIONS
     ]
     left_out = sum(max(0, len(each) - MAX_AFFORDANCES) for each in (topics, services, actions))
     return RobotThing(

@@ -237,9 +237,7 @@ class FileUploader:
                 f"the folder of the file group {group.name} can be read again",
             )
 
-    def _find(
-        self, groups: list[FileGroupSettings], unreadable: dict[str, str]
-    ) -> Iterator[_Candidate]:
+    def _find(self, groups: list[FileGroupSettings], unreadable: dict[str, str]) -> Iterator[_Candidate]:
         """The files to upload, group by group. It is continued in threads, one batch after the other.
 
         :param unreadable: gets the groups whose folder can't be read, with the reason

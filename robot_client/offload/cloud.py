@@ -157,7 +157,9 @@ class Cloud:
             dialled = self._dialled
             if dialled is None:
                 dialled = self._dialled = Future()
-                threading.Thread(target=self._dial, args=(dialled,), name="dial the relay", daemon=True).start()
+                threading.Thread(
+                    target=self._dial, args=(dialled,), name="dial the relay", daemon=True
+                ).start()
         try:
             return dialled.result(max(0.0, seconds))
         except FutureTimeout:

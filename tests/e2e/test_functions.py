@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -97,6 +98,62 @@ def test_functions_in_the_portal(world: OffloadingRelay, browser: Browser) -> No
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         sleeping.get_by_test_id("job-remove").click()
         expect(sleeping.get_by_test_id("job-state")).to_have_text("cancelled", timeout=60_000)
+
+
+def test_a_function_is_an_action_for_rosbridge(world: OffloadingRelay, tmp_path: Path) -> None:
+    """With feedback, a result, a reason, and cancelled; also for a robot that is away."""
+    with world.relay.connect("rover", world.ann) as client:
+        assert "/relay/run_function" in client.call("/rosapi/action_servers")["values"]["action_servers"]
+        found = client.call("/rosapi/action_type", {"action": "/relay/run_function"})["values"]["type"]
+        details = client.call("/rosapi/action_goal_details", {"type": found})["values"]["typedefs"]
+        assert details[0]["fieldnames"] == ["function", "arguments", "version", "deadline"]
+
+        def send(id: str, function: str, **arguments: Any) -> None:
+            args = {"function": function, "arguments": json.dumps(arguments)}
+            client.send(
+                op="send_action_goal", id=id, action="/relay/run_function", action_type=found, args=args,
+                feedback=True,
+            )  # fmt: skip
+
+        def ended(id: str) -> tuple[int, bool, Any]:
+            answer = client.until(op="action_result", id=id)
+            return answer["status"], answer["result"], answer["values"]
+
+        send("one", "report", steps=2, go_on=str(tmp_path / "go on"))
+        feedback = client.until(op="action_feedback", id="one")["values"]
+        assert feedback == {"progress": 0.5, "text": "half", "state": "running"}
+        (tmp_path / "go on").touch()
+        status, has_result, values = ended("one")
+        assert (status, has_result, values["state"], values["result"]) == (4, True, "done", "2")
+        send("two", "fail", words="no light")
+        status, has_result, words = ended("two")
+        assert (status, has_result) == (6, False)
+        assert words.startswith("error: ")
+        assert "no light" in words
+        send("three", "report", steps=2, go_on=str(tmp_path / "never"))
+        client.until(op="action_feedback", id="three")
+        client.send(op="cancel_action_goal", id="three", action="/relay/run_function")
+        assert ended("three")[:2] == (5, False)
+        for arguments in (
+            {"function": "nothing"},
+            {"function": "add", "arguments": "{"},
+            {"function": 5},
+            [1],
+        ):
+            client.send(op="send_action_goal", id="bad", action="/relay/run_function", args=arguments)
+            assert ended("bad")[:2] == (0, False)
+        send("four", "report", steps=2, go_on=str(tmp_path / "never"))
+        client.until(op="action_feedback", id="four")
+    wait_for("the end of the connection cancels it", lambda: not running_jobs(world))
+    with world.relay.connect("rover", world.bob) as client:
+        client.send(op="send_action_goal", id="no", action="/relay/run_function", args={"function": "add"})
+        answer = client.until(op="action_result", id="no")
+        assert (answer["status"], "run" in answer["values"]) == (0, True)
+
+
+def running_jobs(world: OffloadingRelay) -> list[Any]:
+    jobs = world.ask("GET", "/api/v1/jobs").json["jobs"]
+    return [each for each in jobs if each["state"] in ("queued", "running")]
 
 
 def test_large_values_go_as_binary(world: OffloadingRelay) -> None:

@@ -88,7 +88,9 @@ def test_a_large_file_is_hashed_in_turns(tmp_path: Path, monkeypatch: pytest.Mon
     assert not large.exists()
 
 
-def test_a_file_that_always_arrives_changed_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_always_arrives_changed_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A robot with bad memory or a bad disk: the first copies may be chance."""
     world = FileWorld(tmp_path)
     path = world.write("a.bag", b"right")

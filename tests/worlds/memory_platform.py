@@ -370,5 +370,8 @@ class MemoryPlatform(Platform):
     def battery(self) -> float | None:
         return self.charge
 
+    def publish_device(self, state: link.DeviceReport) -> None:
+        pass
+
     def fault(self) -> str | None:
         return None

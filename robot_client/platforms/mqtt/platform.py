@@ -215,6 +215,9 @@ class MqttPlatform(Platform):
     def battery(self) -> float | None:
         return None
 
+    def publish_device(self, state: link.DeviceReport) -> None:
+        """Nothing: the computer is the gateway's, and a device has no graph."""
+
     def later(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call on the next turn of the reactor."""
         self._reactor.callLater(0, call, *arguments)

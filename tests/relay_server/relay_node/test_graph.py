@@ -77,7 +77,7 @@ ANSWERS: list[tuple[str, Any, Any]] = [
             "services": sorted(name for name in SERVICES if name.startswith("/relay/")),
         },
     ),
-    ("action_servers", None, {"action_servers": ["/dock"]}),
+    ("action_servers", None, {"action_servers": ["/dock", "/relay/run_function"]}),
     ("action_type", {"action": "dock"}, {"type": "a_msgs/action/Dock"}),
     ("action_type", {"action": "/vault/dig"}, {"type": ""}),
     ("action_type", {"action": "/none"}, {"type": ""}),
@@ -163,8 +163,8 @@ def test_services_of_clients_belong_to_the_relay_node(world: World, operator: Pe
     world.channel.message(link.AdvertisedAction(action="/walk", type="a_msgs/action/Dock"))
     assert ask(other, "/rosapi/service_type", {"service": "/add"}) == {"type": TRIGGER}
     assert ask(other, "/rosapi/service_node", {"service": "/add"}) == {"node": "/relay"}
-    assert ask(other, "/rosapi/action_servers") == {"action_servers": []}
-    assert ask(operator, "/rosapi/action_servers") == {"action_servers": ["/walk"]}
+    assert ask(other, "/rosapi/action_servers") == {"action_servers": ["/relay/run_function"]}
+    assert ask(operator, "/rosapi/action_servers") == {"action_servers": ["/relay/run_function", "/walk"]}
     assert ask(operator, "/rosapi/action_type", {"action": "walk"}) == {"type": "a_msgs/action/Dock"}
     assert "/add" in ask(operator, "/rosapi/node_details", {"node": "/relay"})["services"]
     assert "/add" not in ask(viewer, "/rosapi/services")["services"]

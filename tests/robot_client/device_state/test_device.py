@@ -41,7 +41,9 @@ class Kernel:
         )
 
     def signal(self, *levels: str) -> None:
-        lines = [f" wlan{i}: 0000   {60 + i}.  {level}  -256        0      0\n" for i, level in enumerate(levels)]
+        lines = [
+            f" wlan{i}: 0000   {60 + i}.  {level}  -256        0      0\n" for i, level in enumerate(levels)
+        ]
         self.write("proc/net/wireless", HEAD + "".join(lines))
 
     def readings(self) -> DeviceReadings:

@@ -31,7 +31,13 @@ async def test_programs_of_the_graph_read_the_state(ros: Ros2Platform, peer: Pee
         source = ros.subscribe("/device_state", DIAGNOSTICS, LATCHED, found.append, lambda: None)
         await until(lambda found=found: bool(found))
         statuses = {each.name: each for each in deserialize_message(found[0], DiagnosticArray).status}
-        assert [(each.level, each.message) for each in statuses.values()] == [(b"\x02", "critical"), (b"\0", "")]
-        assert [(each.key, each.value) for each in statuses["signal"].values] == [("value", "-61"), ("unit", "dBm")]
+        assert [(each.level, each.message) for each in statuses.values()] == [
+            (b"\x02", "critical"),
+            (b"\0", ""),
+        ]
+        assert [(each.key, each.value) for each in statuses["signal"].values] == [
+            ("value", "-61"),
+            ("unit", "dBm"),
+        ]
         source.close()
         ros.renew()

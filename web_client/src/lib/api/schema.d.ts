@@ -7036,7 +7036,7 @@ export interface components {
         DeviceInfo: {
             /** @description when it was measured, Unix time at the robot, seconds */
             at: number;
-            /** @description by component: `battery`, `cpu`, `memory` and `disk` in per cent, `temperature` in degrees Celsius, `signal` in dBm; what can't be read is left out */
+            /** @description by component: `battery`, `cpu`, `memory` and `disk` in per cent, `temperature` in degrees Celsius, `signal` (wireless) in dBm and its `quality`; what can't be read is left out */
             readings: {
                 [key: string]: number;
             };
