@@ -8,6 +8,7 @@ import msgspec
 from msgspec import Meta
 from twisted.internet.defer import CancelledError
 
+from relay_protocol import jsontext
 from relay_protocol.errors import MalformedMessage
 from relay_protocol.functions import FAULTS, CallFailed, to_json
 from relay_protocol.limits import NAME
@@ -18,6 +19,7 @@ from relay_server.http.media_types import JSON, MSGPACK, MediaType, sent
 from relay_server.http.openapi.operation import header, raw
 from relay_server.http.request_fields import wait_preferred
 from relay_server.offload.jobs import Job
+from relay_server.offload.openapi import functions_document
 from relay_server.offload.schemas import FunctionList, FunctionResult, JobList, JobStatus
 from relay_server.offload.service import FunctionService, job_owner
 
@@ -81,6 +83,20 @@ class FunctionEndpoints:
     )
     async def functions(self, request: ApiRequest) -> FunctionList:
         return await self._service.functions(request.principal)
+
+    @endpoint(
+        "GET",
+        f"{FUNCTIONS_PATH}/openapi.json",
+        tag="functions",
+        summary="The functions that the caller may run as an OpenAPI document",
+        more="Each function is a path, with the schemas of its arguments and of its result, so that generators of "
+        "clients know them.",
+        returns="OpenAPI 3.1",
+        seconds=60.0,
+    )
+    async def openapi(self, request: ApiRequest) -> Document:
+        found = await self._service.functions(request.principal)
+        return Document(jsontext.encode(functions_document(FUNCTIONS_PATH, found.functions)), JSON.media)
 
     @endpoint(
         "POST",

@@ -11,6 +11,8 @@ from typing import Any
 
 import msgspec
 import pytest
+from jsonschema import Draft202012Validator
+from openapi_spec_validator import OpenAPIV31SpecValidator
 from playwright.sync_api import Browser, expect
 
 from relay_protocol.functions import array_bytes, encode_value
@@ -98,6 +100,21 @@ def test_functions_in_the_portal(world: OffloadingRelay, browser: Browser) -> No
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         sleeping.get_by_test_id("job-remove").click()
         expect(sleeping.get_by_test_id("job-state")).to_have_text("cancelled", timeout=60_000)
+
+
+def test_functions_have_an_openapi_document(world: OffloadingRelay) -> None:
+    """A generic client calls a function by it alone; it has the functions of its caller."""
+    found = world.ask("GET", "/api/v1/functions/openapi.json").json
+    OpenAPIV31SpecValidator(found).validate()
+    call = found["paths"]["/api/v1/functions/add"]["post"]
+    body = call["requestBody"]["content"]["application/json"]["schema"]["properties"]["arguments"]
+    arguments = found["components"]["schemas"][body["$ref"].rpartition("/")[2]]
+    assert (arguments["required"], arguments["properties"]["b"]["default"]) == (["a"], 1.0)
+    for values, valid in (({"a": 1, "b": 2}, True), ({"a": "one"}, False), ({"a": 1, "c": 2}, False)):
+        schema = {"$ref": body["$ref"], "components": found["components"]}
+        assert Draft202012Validator(schema).is_valid(values) is valid
+    of_bob = world.ask("GET", "/api/v1/functions/openapi.json", token=world.bob).json
+    assert of_bob["paths"].keys() <= {"/api/v1/functions/size_of"}
 
 
 def test_a_function_is_an_action_for_rosbridge(world: OffloadingRelay, tmp_path: Path) -> None:
