@@ -48,8 +48,8 @@ def functions_document(path: str, functions: Iterable[FunctionDescription]) -> d
         "info": {
             "title": "Functions of this relay",
             "version": "1",
-            "description": "Functions that the caller may run, as the workers have them now. Jobs and MessagePack are in "
-            "`/api/openapi.json`.",
+            "description": "Functions that the caller may run, as the workers have them now. "
+            "`/api/openapi.json` has everything else.",
         },
         "servers": [{"url": "/"}],
         "security": [{"token": []}],
