@@ -97,7 +97,9 @@ class DaemonProcess:
         self._local_orders = LocalOrderServer(self.modules, modules)
         self.device = DeviceManager(
             settings.offload,
-            DeviceReadings(modules.parent, self.platform.battery),
+            DeviceReadings(
+                (modules.parent, *(Path(each.folder) for each in settings.file_group)), self.platform.battery
+            ),
             modules.parent,
             send=connection.send,
             publish=self.platform.publish_device,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from robot_client.device_state.rules import BATTERY, CPU, DISK, MEMORY, QUALITY, SIGNAL, TEMPERATURE
@@ -12,13 +13,15 @@ from robot_client.device_state.rules import BATTERY, CPU, DISK, MEMORY, QUALITY,
 class DeviceReadings:
     """Reads CPU, memory, disk, temperature and wireless signal.
 
-    :param folder: whose disk counts
+    :param folders: whose disks count
     :param battery: charge from 0 to 1 as the robot's topic says, ``None`` if it says none
     :param root: folder with ``proc`` and ``sys``
     """
 
-    def __init__(self, folder: Path, battery: Callable[[], float | None], root: Path = Path("/")) -> None:
-        self._folder = folder
+    def __init__(
+        self, folders: Iterable[Path], battery: Callable[[], float | None], root: Path = Path("/")
+    ) -> None:
+        self._folders = list(folders)
         self._battery = battery
         self._root = root
         self._times = self._cpu_times()
@@ -90,12 +93,15 @@ class DeviceReadings:
         return 100 * (1 - available / total)
 
     def _disk(self) -> float | None:
-        try:
-            found = os.statvfs(self._folder)
-        except OSError:
-            return None
-        used = found.f_blocks - found.f_bfree
-        return 100 * used / (used + found.f_bavail) if used + found.f_bavail else None
+        """Of the fullest disk."""
+        found = []
+        for folder in self._folders:
+            with suppress(OSError):
+                disk = os.statvfs(folder)
+                used = disk.f_blocks - disk.f_bfree
+                if used + disk.f_bavail:
+                    found.append(100 * used / (used + disk.f_bavail))
+        return max(found, default=None)
 
     def _temperature(self) -> float | None:
         zones = self._children("sys/class/thermal")

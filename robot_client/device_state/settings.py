@@ -15,7 +15,8 @@ class CriticalValues(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     :param battery: charge at or below this, per cent
     :param cpu: load of the whole machine at or above this, per cent
     :param memory: in use at or above this, per cent
-    :param disk: in use at or above this, per cent, of the disk with the daemon's state folder
+    :param disk: in use at or above this, per cent, of the fullest disk with the daemon's state folder or the folder of
+        a group of files
     :param temperature: of the hottest sensor at or above this, degrees Celsius
     :param signal: of the wireless link at or below this, dBm
     :param quality: of the wireless link at or below this, in its driver's scale, which often ends at 70

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,8 +26,9 @@ from tests.worlds.chaos_proxy import ChaosProxy
 from tests.worlds.file_daemon import PRESSURE, file_daemon
 from tests.worlds.forked_programs import run_command
 from tests.worlds.http_requests import ask
-from tests.worlds.processes import BIN, running
+from tests.worlds.processes import BIN, ros_environment, running
 from tests.worlds.relay_process import Relay
+from tests.worlds.ros_domains import free_domain
 from tests.worlds.waiting import wait_for
 
 
@@ -151,6 +154,18 @@ def test_what_the_daemon_measures_sends_a_function_to_a_worker(world: RobotProgr
             return answer.status == 200 and answer.json["critical"]
 
         wait_for("the relay knows", lambda: (shown() or {}).get("memory"))
+
+
+def test_a_ros_node_that_is_a_module_calls_functions(world: RobotProgram, tmp_path: Path) -> None:
+    """In its callbacks; it knows the robot's key from the daemon."""
+    found, settings = tmp_path / "sum", tmp_path / "robot.toml"
+    command = [sys.executable, "-m", "tests.worlds.adding_node", str(found)]
+    settings.write_text(
+        f'[safety]\nguard = false\n\n[[module]]\nname = "adding"\ncommand = {json.dumps(command)}\n'
+    )
+    with running(file_daemon(world.state, settings, tmp_path, **ros_environment(free_domain()))):
+        wait_for("a sum comes", found.exists)
+    assert found.read_text() == "42.0 cloud 2.0"
 
 
 def test_without_the_relay_a_function_runs_here(world: RobotProgram, tmp_path: Path) -> None:

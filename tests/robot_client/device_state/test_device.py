@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -47,7 +49,7 @@ class Kernel:
         self.write("proc/net/wireless", HEAD + "".join(lines))
 
     def readings(self) -> DeviceReadings:
-        return DeviceReadings(self.root, lambda: self.charge, self.root)
+        return DeviceReadings([self.root], lambda: self.charge, self.root)
 
 
 @pytest.fixture
@@ -93,8 +95,23 @@ def test_the_battery_is_that_of_the_robots_topic_or_else_of_the_system(kernel: K
 
 
 def test_what_can_not_be_read_is_left_out(tmp_path: Path) -> None:
-    readings = DeviceReadings(tmp_path / "none", lambda: None, tmp_path / "none")
+    readings = DeviceReadings([tmp_path / "none"], lambda: None, tmp_path / "none")
     assert readings.read() == {}
+
+
+def test_the_fullest_disk_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot's recordings are often on another disk than its system."""
+    used = {"/state": 40, "/bags": 93, "/maps": 12}
+
+    def statvfs(folder: Path) -> Any:
+        if str(folder) not in used:
+            raise FileNotFoundError
+        left = 100 - used[str(folder)]
+        return SimpleNamespace(f_blocks=100, f_bfree=left, f_bavail=left)
+
+    monkeypatch.setattr(os, "statvfs", statvfs)
+    folders = [Path(each) for each in ("/state", "/bags", "/maps", "/unplugged")]
+    assert DeviceReadings(folders, lambda: None).read()["disk"] == 93.0
 
 
 FINE = {

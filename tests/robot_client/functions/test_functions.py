@@ -71,4 +71,6 @@ def test_frames_are_analysed_exhaustively() -> None:
     found = run("analyse_frames", frames=[picture(100, 60), picture(104, 60), picture(104, 60)])
     assert [len(each["faces"]) for each in found] == [1, 1, 1]
     assert [each["motion"] > 0.05 for each in found] == [False, True, False]
-    assert all(each["keypoints"] > 50 and 0 < each["edges"] < 0.5 and each["sharpness"] > 10 for each in found)
+    assert all(
+        each["keypoints"] > 50 and 0 < each["edges"] < 0.5 and each["sharpness"] > 10 for each in found
+    )
