@@ -95,16 +95,7 @@ class DaemonProcess:
         connection = self._build_connection(identity)
         self.modules = self._build_modules(settings, modules)
         self._local_orders = LocalOrderServer(self.modules, modules)
-        self.device = DeviceManager(
-            settings.offload,
-            DeviceReadings(
-                (modules.parent, *(Path(each.folder) for each in settings.file_group)), self.platform.battery
-            ),
-            modules.parent,
-            send=connection.send,
-            publish=self.platform.publish_device,
-            alert=self._alert,
-        )
+        self.device = self._build_device(settings, modules.parent, connection)
         requests = ModuleRequests(
             self.modules,
             modules,
@@ -208,6 +199,19 @@ class DaemonProcess:
             backoff=Backoff(secrets.SystemRandom().random),
             robot=identity.robot,
             addresses=self._addresses,
+        )
+
+    def _build_device(
+        self, settings: RobotSettings, state: Path, connection: ControlConnection
+    ) -> DeviceManager:
+        folders = (state, *(Path(each.folder) for each in settings.file_group))
+        return DeviceManager(
+            settings.offload,
+            DeviceReadings(folders, self.platform.battery),
+            state,
+            send=connection.send,
+            publish=self.platform.publish_device,
+            alert=self._alert,
         )
 
     def _build_modules(self, settings: RobotSettings, folder: Path) -> ModuleSupervisor:
