@@ -13,6 +13,7 @@ from urllib.parse import quote
 import pytest
 from playwright.sync_api import Browser, expect
 
+from robot_client.device_state.rules import RULES
 from robot_client.offload import Device
 from tests.worlds.accessibility import violations
 from tests.worlds.browser import checked_pages, open_session
@@ -132,7 +133,7 @@ def test_the_device_manager_is_seen_at_the_relay_and_in_a_file(world: World) -> 
     )
     device = ask(world.relay.http_port, "GET", path, token=world.bob).json
     assert 0 < device["readings"]["memory"] <= 100
-    assert set(device["critical"]) == {"battery", "cpu", "memory", "disk", "temperature", "signal"}
+    assert set(device["critical"]) == set(RULES)
     published = json.loads((world.state / "device.json").read_bytes())
     assert set(published) == {"at", "critical", "readings", "where"}
 

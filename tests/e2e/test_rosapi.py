@@ -57,7 +57,7 @@ def lab(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
                 wanted = {
                     f"{node}/{each}" for node in ("/lab/arm", "/vault/safe") for each in PARAMETER_SERVICES
                 }
-                return {*wanted, "/lab/everything", "/vault/open"} <= set(services) and len(actions) == 2
+                return {*wanted, "/lab/everything", "/vault/open"} <= set(services) and len(actions) == 3
 
             wait_for("the nodes are known", known)
         yield world
@@ -163,7 +163,9 @@ def _says_what_is_there(reported: dict[str, Any]) -> None:
     assert "/lab/everything" in reported["node_details"]["services"]
     assert reported["publishers"] == {"publishers": ["/lab/arm"]}
     assert reported["subscribers"] == {"subscribers": ["/lab/arm"]}
-    assert reported["action_servers"] == {"action_servers": ["/lab/walk", "/vault/dig"]}
+    assert reported["action_servers"] == {
+        "action_servers": ["/lab/walk", "/relay/run_function", "/vault/dig"]
+    }
     assert reported["action_type"] == {"type": WALK}
     interfaces = reported["interfaces"]["interfaces"]
     assert {NESTED, EVERYTHING, WALK, "std_msgs/msg/String", "rosapi_msgs/srv/Topics"} <= set(interfaces)
@@ -227,7 +229,7 @@ def test_roslib_js_asks_with_all_its_helpers(lab: Any) -> None:
     assert "/lab/arm" in seen["nodes"]
     assert "/lab/nested" in seen["node"]["publishing"]
     assert "/lab/arm:titles" in seen["params"]
-    assert seen["actions"] == ["/lab/walk", "/vault/dig"]
+    assert seen["actions"] == ["/lab/walk", "/relay/run_function", "/vault/dig"]
     decoded = seen["decoded"]
     assert decoded["header"] == {"stamp": {"sec": "int32", "nanosec": "uint32"}, "frame_id": "string"}
     assert decoded["sequences"][0]["inners"] == [{"id": "uint8", "weight": "double", "label": "string"}]
