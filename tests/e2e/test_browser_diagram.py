@@ -14,6 +14,8 @@ from tests.worlds.accessibility import violations
 from tests.worlds.browser import checked_pages, open_session, portal
 from tests.worlds.diagram import NAME, ROLE, TASKS, DiagramWorld, UserInput, do_tasks, row, table, take_back
 from tests.worlds.processes import running
+from tests.worlds.small_robot import SmallRobot
+from tests.worlds.waiting import wait_for
 
 WAIT_SECONDS = 60.0
 
@@ -85,6 +87,30 @@ def test_a_topic_calls_a_service_and_a_program_is_a_box(world: DiagramWorld, pag
         row(page, "robot:pad /beep()").get_by_test_id("open").click()
         take_back(page)
     expect(row(page, "program:lamp power")).to_have_count(0)
+
+
+def test_a_field_is_sent_in_the_goals_of_an_action(world: DiagramWorld, page: Page) -> None:
+    """The relay's own actions are not shown."""
+    robot = SmallRobot(world.relay, "feeder", {}, actions={"/feed": "float64 amount\n---\nstring words\n---\n"})
+    world.relay.cli("right", "grant", "ann", "feeder", "operator")
+    robot.comes()
+    try:
+        page.goto("/diagram")
+        user = UserInput(page)
+        row(page, "robot:feeder /feed{}").get_by_test_id("open").click()
+        row(page, "robot:feeder /feed{}# words").wait_for()
+        row(page, "robot:pad /temperature").get_by_test_id("open").click()
+        user.press_at(row(page, "robot:pad /temperature#data").get_by_test_id("source"))
+        user.drag_to(row(page, "robot:feeder /feed{}#amount").get_by_test_id("target"))
+        expect(page.get_by_test_id("drag-hint")).to_contain_text("makes a pipe.")
+        user.release()
+        expect(page.get_by_test_id("panel").get_by_test_id("pipe-state")).to_have_text("running")
+        wait_for("goals arrive", lambda: any(each["amount"] > 0 for each in robot.goals))
+        expect(row(page, "robot:feeder /relay/run_function{}")).to_have_count(0)
+        take_back(page)
+    finally:
+        robot.goes()
+        world.relay.cli("robot", "remove", "feeder", "--yes")
 
 
 DROP = """([name, text]) => {

@@ -19,6 +19,7 @@ from tests.worlds.waiting import PATIENCE, wait_for
 
 TRIGGER = "std_srvs/srv/Trigger"
 STRING = "std_msgs/msg/String"
+ACTION = "small_msgs/action/Work"
 HERE = "/base"
 CAMERA = "/camera"
 
@@ -49,6 +50,7 @@ class SmallRobot:
     :param source: address that it connects from
     :param port: the relay's for robots, or that of a proxy
     :param context: of TLS, if the port has it
+    :param actions: their names, with the text of the type of all, :data:`ACTION`
     """
 
     def __init__(
@@ -61,6 +63,7 @@ class SmallRobot:
         *,
         port: int = 0,
         context: ssl.SSLContext | None = None,
+        actions: dict[str, str] | None = None,
     ) -> None:
         self.relay = relay
         self.name = name
@@ -81,6 +84,9 @@ class SmallRobot:
         self._port = port
         self._context = context
         self._services = services
+        self._actions = actions or {}
+        self.goals: list[Any] = []
+        """Arguments of the goals that it has reached."""
         self._moving = list(moving)
         self._key = name.encode().ljust(32, b"\0")[:32]
         self._links: list[End] = []
@@ -97,7 +103,10 @@ class SmallRobot:
         control.send(link.Describe(platform="json", motion=motion))
         services = {name: link.Service(types=[TRIGGER], providers=[HERE]) for name in self._services}
         topics = {"/mode": link.Topic(types=[STRING], subscribers=[HERE])}
-        control.send(link.Graph(full=True, topics=topics, services=services, nodes={HERE: {}}))
+        actions = {name: link.Service(types=[ACTION], providers=[HERE]) for name in self._actions}
+        control.send(
+            link.Graph(full=True, topics=topics, services=services, actions=actions, nodes={HERE: {}})
+        )
         if self.picture:
             control.send(link.Cameras(cameras=[link.Camera(name=CAMERA)]))
         if self.modules:
@@ -182,6 +191,11 @@ class SmallRobot:
         if op == "advertise":
             number, topic, kind = message["number"], message["topic"], message["type"]
             channel.send(link.Advertised(number=number, topic=topic, type=kind, encoding="json"))
+        elif op == "get_type" and message["type"] == ACTION:
+            channel.send(link.TypeDefinition(type=ACTION, text=next(iter(self._actions.values()))))
+        elif op == "send_action_goal":
+            self.goals.append(message["args"])
+            channel.send(link.ActionResult(id=message["id"], status=4, result=True, values={}))
         elif op == "call_service":
             self.calls.append((message["service"], message.get("source", 0)))
             answer = self._services[message["service"]](self, message.get("args"))

@@ -117,6 +117,10 @@ export async function servicesOf(robot: string): Promise<{ name: string; types: 
   return (await ask('get', '/api/v1/robots/{robot}/services', { names: { robot }, query: { limit: 1000 } })).services
 }
 
+export async function actionsOf(robot: string): Promise<{ name: string; types: string[]; moves: boolean }[]> {
+  return (await ask('get', '/api/v1/robots/{robot}/actions', { names: { robot }, query: { limit: 1000 } })).actions
+}
+
 interface Topic {
   name: string
   types: string[]

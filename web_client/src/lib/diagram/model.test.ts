@@ -8,8 +8,9 @@ import {
   elementsOfProgram,
   elementsOfRobot,
   elementsOfRole,
-  elementsOfService,
+  elementsOfCalled,
   elementsOfTopic,
+  actionId,
   argumentId,
   fieldId,
   fullName,
@@ -34,7 +35,7 @@ function robot(name: string, topic: string, type: string, way: 'gives' | 'takes'
     { name: topic, types: [type], publishers, subscribers, moves: topic === '/cmd_vel' },
     { name: '/rosout', types: ['Log'], publishers: ['/n'], subscribers: [], moves: false },
   ]
-  const [found, service] = elementsOfRobot({ name, online: true, topics, services: [{ name: '/beep', types: ['Trigger'], moves: false }] })
+  const [found, service] = elementsOfRobot({ name, online: true, topics, services: [{ name: '/beep', types: ['Trigger'], moves: false }], actions: [] })
   return [found!, ...elementsOfTopic(found!, type === 'Float' ? FLOAT : TWIST, undefined), service!]
 }
 
@@ -68,8 +69,18 @@ const ROLE = elementsOfRole(
 const LAMP = elementsOfProgram({ name: 'lamp', ports: ['power'], functions: ['blink'] })
 const REQUEST: TypeDef[] = [{ type: 'Switch_Request', fieldnames: ['on'], fieldtypes: ['bool'], fieldarraylen: [-1] }]
 const REPLY: TypeDef[] = [{ type: 'Switch_Response', fieldnames: ['success', 'message'], fieldtypes: ['bool', 'string'], fieldarraylen: [-1, -1] }]
-const [SERVICE] = elementsOfRobot({ name: 'home', online: true, topics: [], services: [{ name: '/switch', types: ['Switch'], moves: false }] })
-const HOME = [SERVICE!, ...elementsOfService(SERVICE!, REQUEST, REPLY)]
+const [SERVICE] = elementsOfRobot({ name: 'home', online: true, topics: [], services: [{ name: '/switch', types: ['Switch'], moves: false }], actions: [] })
+const HOME = [SERVICE!, ...elementsOfCalled(SERVICE!, REQUEST, REPLY)]
+const [ACTION] = elementsOfRobot({
+  name: 'home',
+  online: true,
+  topics: [],
+  services: [],
+  actions: [{ name: '/dock', types: ['Dock'], moves: true }, { name: '/relay/run_function', types: ['Run'], moves: false }],
+})
+const GOAL: TypeDef[] = [{ type: 'Dock_Goal', fieldnames: ['speed'], fieldtypes: ['float64'], fieldarraylen: [-1] }]
+const RESULT: TypeDef[] = [{ type: 'Dock_Result', fieldnames: ['seconds'], fieldtypes: ['float64'], fieldarraylen: [-1] }]
+const DOCK = [ACTION!, ...elementsOfCalled(ACTION!, GOAL, RESULT)]
 const named = (name: string) => [...PAD, ...ROVER, ...ROLE, ...LAMP, ...HOME].find((each) => each.name === name)!
 
 describe('elements', () => {
@@ -94,6 +105,24 @@ describe('elements', () => {
       ['program:lamp', 'power', 'port'],
       ['program:lamp', 'blink', 'function'],
     ])
+  })
+
+  it('of actions are arguments of goals and fields of results, without the relay’s own', () => {
+    expect(DOCK.map((each) => [fullName(each), each.kind, each.gives, each.takes])).toEqual([
+      ['/dock', 'action', true, true],
+      ['/dock{} speed', 'argument', false, true],
+      ['/dock{} seconds', 'reply', true, false],
+    ])
+    const [dock, speed, seconds] = DOCK
+    const data = named('data')
+    expect(linkOf(data, speed!)).toMatchObject({ makes: 'pipe', moves: true, to: { at: { robot: 'home', action: '/dock' }, path: 'speed' } })
+    expect(linkOf(seconds!, named('power'))).toMatchObject({ makes: 'pipe', from: { at: { action: '/dock' }, path: 'seconds' } })
+    expect(linkOf(data, dock!)).toBe('data is a field and /dock an action. Open /dock and choose a field of it.')
+    const sent = { ...STATUS, target: { ...NOTHING, robot: 'home', action: '/dock' }, fields: [{ ...STATUS.fields[0]!, target: 'speed' }] }
+    const shown = [topicId('pad', '/heat'), actionId('home', '/dock')]
+    const ends = (more: string[]) => linesOfPipes([sent], new Set([...shown, ...more])).map(({ from, to }) => [from, to])
+    expect(ends([])).toEqual([shown])
+    expect(ends([speed!.id])).toEqual([[shown[0], speed!.id]])
   })
 
   it('of Roles have the type of the field that they stand for', () => {
@@ -226,9 +255,9 @@ describe('lines', () => {
     const shown = [topicId('pad', '/heat'), serviceId('home', '/switch'), 'program:lamp power']
     const ends = (pipe: PipeStatus, more: string[] = []) => linesOfPipes([pipe], new Set([...shown, ...more])).map(({ from, to }) => [from, to])
     expect(ends(call)).toEqual([[shown[0], shown[1]]])
-    expect(ends(call, [argumentId('home', '/switch', 'on')])).toEqual([[shown[0], argumentId('home', '/switch', 'on')]])
+    expect(ends(call, [argumentId(serviceId('home', '/switch'), 'on')])).toEqual([[shown[0], argumentId(serviceId('home', '/switch'), 'on')]])
     const answer = { ...STATUS, source: call.target, target: { ...NOTHING, program: 'lamp', port: 'power' } }
-    expect(ends(answer, [replyId('home', '/switch', 'data')])).toEqual([[replyId('home', '/switch', 'data'), 'program:lamp power']])
+    expect(ends(answer, [replyId(serviceId('home', '/switch'), 'data')])).toEqual([[replyId(serviceId('home', '/switch'), 'data'), 'program:lamp power']])
   })
 
   it('of mappings go within a Role, or to another that is shown', () => {

@@ -30,8 +30,8 @@ export interface Element {
   /** Name of the robot, program or Role. */
   owner: string
   name: string
-  /** An argument is a field of a service's requests, a reply one of its answers. */
-  kind: 'topic' | 'field' | 'service' | 'argument' | 'reply' | 'port' | 'function' | 'item'
+  /** An argument is a field of a service's requests or an action's goals, a reply one of its answers or results. */
+  kind: 'topic' | 'field' | 'service' | 'action' | 'argument' | 'reply' | 'port' | 'function' | 'item'
   /** Type for people: of messages, of the field, or of the item. */
   type: string
   /** Where its value comes from; null without a topic. */
@@ -59,6 +59,7 @@ export interface Topic {
   moves: boolean
 }
 
+/** A service or an action. */
 export interface Service {
   name: string
   types: string[]
@@ -70,6 +71,7 @@ export interface RobotParts {
   online: boolean
   topics: Topic[]
   services: Service[]
+  actions: Service[]
 }
 
 export const robotId = (robot: string) => `robot:${robot}`
@@ -78,8 +80,10 @@ export const roleId = (role: string) => `role:${role}`
 export const topicId = (robot: string, topic: string) => `${robotId(robot)} ${topic}`
 export const fieldId = (robot: string, topic: string, path: string) => `${topicId(robot, topic)}#${path}`
 export const serviceId = (robot: string, service: string) => `${robotId(robot)} ${service}()`
-export const argumentId = (robot: string, service: string, path: string) => `${serviceId(robot, service)}#${path}`
-export const replyId = (robot: string, service: string, path: string) => `${serviceId(robot, service)}# ${path}`
+export const actionId = (robot: string, action: string) => `${robotId(robot)} ${action}{}`
+/** @param called id of the service or action */
+export const argumentId = (called: string, path: string) => `${called}#${path}`
+export const replyId = (called: string, path: string) => `${called}# ${path}`
 export const partId = (program: string, part: string) => `${programId(program)} ${part}`
 export const itemId = (role: string, iri: string) => `${roleId(role)} ${iri}`
 
@@ -90,8 +94,8 @@ const TOOLS = /\/(get|set|list|describe)_(parameters?|parameter_types|parameters
 /** The node under which the relay's own endpoints are listed: a page that shows a value is no subscriber of the robot. */
 const RELAY = '/relay'
 
-/** Topics and services of a robot. */
-export function elementsOfRobot({ name, topics, services }: RobotParts): Element[] {
+/** Topics, services and actions of a robot. */
+export function elementsOfRobot({ name, topics, services, actions }: RobotParts): Element[] {
   const node = robotId(name)
   const shared = { node, owner: name, basic: null, item: null, bound: [] }
   return [
@@ -118,6 +122,13 @@ export function elementsOfRobot({ name, topics, services }: RobotParts): Element
         const [id, type] = [serviceId(name, service.name), service.types[0] ?? '']
         const end = { at: { robot: name, service: service.name }, type, path: '' }
         return { ...shared, id, name: service.name, kind: 'service', type, place: null, end, gives: true, takes: true, moves: service.moves }
+      }),
+    ...actions
+      .filter((action) => !TOOLS.test(action.name))
+      .map((action): Element => {
+        const [id, type] = [actionId(name, action.name), action.types[0] ?? '']
+        const end = { at: { robot: name, action: action.name }, type, path: '' }
+        return { ...shared, id, name: action.name, kind: 'action', type, place: null, end, gives: true, takes: true, moves: action.moves }
       }),
   ]
 }
@@ -161,18 +172,17 @@ export function elementsOfTopic(topic: Element, definitions: TypeDef[], message:
   }))
 }
 
-/** Arguments and fields of the replies of a service.
+/** Arguments and fields of the replies of a service, or of the goals and results of an action.
  *
- * @param request definitions of its requests
- * @param response definitions of its replies
+ * @param request definitions of its requests or goals
+ * @param response definitions of its replies or results
  */
-export function elementsOfService(service: Element, request: TypeDef[], response: TypeDef[]): Element[] {
-  const end = service.end
+export function elementsOfCalled(called: Element, request: TypeDef[], response: TypeDef[]): Element[] {
+  const end = called.end
   if (end === null) return []
-  const [robot, name] = [end.at.robot ?? '', end.at.service ?? '']
   const made = (kind: 'argument' | 'reply', field: Field): Element => ({
-    ...service,
-    id: (kind === 'argument' ? argumentId : replyId)(robot, name, field.path),
+    ...called,
+    id: (kind === 'argument' ? argumentId : replyId)(called.id, field.path),
     name: field.path,
     kind,
     type: field.type,
@@ -189,7 +199,7 @@ export function elementsOfService(service: Element, request: TypeDef[], response
 
 /** Whether an element can be opened. */
 export function opens({ kind }: Element): boolean {
-  return kind === 'topic' || kind === 'service'
+  return kind === 'topic' || kind === 'service' || kind === 'action'
 }
 
 /** Whether an element is a part of one that can be opened. */
@@ -197,7 +207,7 @@ export function isPart({ kind }: Element): boolean {
   return kind === 'field' || kind === 'argument' || kind === 'reply'
 }
 
-/** The id of the topic or service that an element is, or is a part of. */
+/** The id of the topic, service or action that an element is, or is a part of. */
 export function wholeId({ id }: Pick<Element, 'id'>): string {
   return id.split('#')[0]!
 }
@@ -206,7 +216,17 @@ export function wholeId({ id }: Pick<Element, 'id'>): string {
 export function fullName({ kind, end, name }: Element): string {
   if (end === null) return name
   if (kind === 'field') return `${end.at.topic} ${name}`
-  return kind === 'argument' || kind === 'reply' ? `${end.at.service}() ${name}` : name
+  return kind === 'argument' || kind === 'reply' ? `${calledName(end.at)} ${name}` : name
+}
+
+/** The name of a service or action with the brackets by which users tell them from topics. */
+function calledName({ service, action }: End['at']): string {
+  return action ? `${action}{}` : `${service}()`
+}
+
+/** What is written behind the name of an element that is called. */
+export function brackets({ kind }: Element): string {
+  return kind === 'action' ? '{}' : kind === 'service' || kind === 'function' ? '()' : ''
 }
 
 const DATA = ['data', 'structuredData', 'field', 'port', 'element']
@@ -266,7 +286,7 @@ export function linkOf(from: Element, to: Element): Link | string {
 }
 
 function pipe(from: Element, to: Element): Link | string {
-  if (from.end === null || to.end === null) return 'Only topics, services and programs can be connected.'
+  if (from.end === null || to.end === null) return 'Only topics, services, actions and programs can be connected.'
   if (endText(from.end.at) === endText(to.end.at)) return `${wholeName(from)} can’t be connected to itself.`
   if (from.end.at.program && to.end.at.program) return 'Programs send requests to each other; a pipe needs a robot at one end.'
   const [source, target] = [valueOf(from.end, to.end), valueOf(to.end, from.end)]
@@ -280,7 +300,7 @@ function valueOf(end: End, other: End): End {
 
 function wholeName({ kind, end, name }: Element): string {
   if (kind === 'field' || kind === 'topic') return 'A topic'
-  return kind === 'argument' || kind === 'reply' ? `${end?.at.service}()` : name
+  return end !== null && (kind === 'argument' || kind === 'reply') ? calledName(end.at) : name
 }
 
 function mapping(from: Element, source: Item, to: Element, target: Item): Link | string {
@@ -298,8 +318,8 @@ function mapping(from: Element, source: Item, to: Element, target: Item): Link |
 
 function binding(from: Element, to: Element): Link | string {
   const [element, item] = from.item === null ? [from, to] : [to, from]
-  if (element.end === null || item.item === null) return 'Only topics, services and programs can be connected.'
-  const called = element.kind === 'service' || element.kind === 'function'
+  if (element.end === null || item.item === null) return 'Only topics, services, actions and programs can be connected.'
+  const called = brackets(element) !== ''
   if (CALLED.includes(item.type) && !called) return `${item.name} is called; it can’t stand for ${element.kind === 'port' ? 'a port' : 'a topic'}.`
   if (!CALLED.includes(item.type) && called) return `${element.name} is called; ${item.name} stands for data.`
   if (item.bound.length > 0) return `${item.name} stands for ${item.bound[0]!.text} already.`
@@ -307,23 +327,28 @@ function binding(from: Element, to: Element): Link | string {
 }
 
 function resourceOf({ at, path }: End): string {
-  return at.program ? endText(at) : addressOf(at.robot ?? '', at.topic || at.service || '', path, at.service ? 'services' : 'topics')
+  const kind = at.service ? 'services' : at.action ? 'actions' : 'topics'
+  return at.program ? endText(at) : addressOf(at.robot ?? '', at.topic || at.service || at.action || '', path, kind)
 }
 
 /** Why values can't be carried; null if they can, or if only the relay knows. */
 function carried(from: Element, to: Element, source: End, target: End): string | null {
   if (source.path === '' && target.path === '') {
-    if (source.at.service && target.at.topic) return `${from.name} replies and ${to.name} is a topic. Open both and connect a field to a field.`
+    if ((source.at.service || source.at.action) && target.at.topic) return `${from.name} replies and ${to.name} is a topic. Open both and connect a field to a field.`
     if (!(source.at.topic && target.at.topic)) return null
     if (source.type === target.type || source.type === '' || target.type === '') return null
     return `${from.name} has messages of ${source.type}, ${to.name} takes ${target.type}. Open both and connect a field to a field.`
   }
-  const [whole, parts] = [source.at.service ? 'a service' : 'a whole message', target.at.service ? 'a service' : 'a whole message']
+  const [whole, parts] = [wholeWords(source), wholeWords(target)]
   if (source.path === '') return `${from.name} is ${whole} and ${to.name} a field. Open ${from.name} and choose a field of it.`
   if (target.path === '') return `${from.name} is a field and ${to.name} ${parts}. Open ${to.name} and choose a field of it.`
   if (target.path.includes('[')) return `${target.path} is a value in a list, which can’t be set alone.`
   if (from.basic === null || to.basic === null) return null
   return misfit(asField(source, from.basic), asField(target, to.basic))
+}
+
+function wholeWords({ at }: End): string {
+  return at.service ? 'a service' : at.action ? 'an action' : 'a whole message'
 }
 
 function asField({ path }: End, type: string): Field {
@@ -415,10 +440,11 @@ export function linesOfPipes(pipes: PipeStatus[], shown: ReadonlySet<string>): L
 }
 
 function end(at: PipeStatus['source'], path: string, shown: ReadonlySet<string>, inner: typeof argumentId): string | null {
-  const { robot, topic, service, program } = at
+  const { robot, topic, service, action, program } = at
   if (program !== '') return shown.has(partId(program, at.port || at.function)) ? partId(program, at.port || at.function) : null
-  const outer = service === '' ? topicId(robot, topic) : serviceId(robot, service)
-  return innerOr(outer, service === '' ? fieldId(robot, topic, path) : inner(robot, service, path), path, shown)
+  const called = service !== '' ? serviceId(robot, service) : action !== '' ? actionId(robot, action) : ''
+  const outer = called || topicId(robot, topic)
+  return innerOr(outer, called === '' ? fieldId(robot, topic, path) : inner(called, path), path, shown)
 }
 
 function innerOr(outer: string, inner: string, path: string, shown: ReadonlySet<string>): string | null {

@@ -139,7 +139,7 @@ export function boundTo(text: string): Bound | null {
 }
 
 /** The address of a topic or service, or of a field of it. */
-export function addressOf(robot: string, name: string, path: string, kind: 'topics' | 'services' = 'topics'): string {
+export function addressOf(robot: string, name: string, path: string, kind: 'topics' | 'services' | 'actions' = 'topics'): string {
   const pointer = path === '' ? '' : `#/${path.replaceAll(/\[(\d+)\]/g, '.$1').split('.').join('/')}`
   return `robots/${encodeURIComponent(robot)}/${kind}/${name.replace(/^\//, '')}${pointer}`
 }

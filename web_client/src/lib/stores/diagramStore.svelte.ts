@@ -178,11 +178,11 @@ export class DiagramStore {
     return reading === undefined ? undefined : { value: valueAt(reading.message, place.path), old: this.nowMs - reading.atMs > OLD_MS }
   }
 
-  /** Fields of a topic, or arguments and fields of replies of a service, whether or not they are shown. */
+  /** Fields of a topic, or arguments and fields of replies of a service or action, whether or not they are shown. */
   fieldsOf(topic: Element): Element[] {
-    if (topic.kind === 'service') {
+    if (isCalled(topic)) {
       const [request, response] = partTypes(topic).map((type) => this.definitionsOf(topic.owner, type))
-      return model.elementsOfService(topic, request!, response!)
+      return model.elementsOfCalled(topic, request!, response!)
     }
     const place = topic.place
     if (place === null) return []
@@ -243,7 +243,7 @@ export class DiagramStore {
   /** Asks for the definition of each type that an element on the page needs. */
   learn(elements: Element[]): void {
     for (const each of elements) {
-      if (each.kind === 'service' && each.type !== '') for (const type of partTypes(each)) void this.ask(each.owner, type)
+      if (isCalled(each) && each.type !== '') for (const type of partTypes(each)) void this.ask(each.owner, type)
       if (each.place !== null && each.place.type !== '') void this.ask(each.place.robot, each.place.type)
     }
   }
@@ -332,9 +332,9 @@ export class DiagramStore {
     const name = nameOf(node)
     if (node.startsWith('program:')) return
     if (node.startsWith('robot:')) {
-      const [{ online, topics }, services] = await Promise.all([api.topicsOf(name), api.servicesOf(name)])
+      const [{ online, topics }, services, actions] = await Promise.all([api.topicsOf(name), api.servicesOf(name), api.actionsOf(name)])
       const known = topics.map((topic) => ({ ...topic, types: topic.types.map(fullType) }))
-      const parts = { name, online, topics: known, services }
+      const parts = { name, online, topics: known, services, actions }
       // The same lists leave the page as it is.
       if (JSON.stringify(parts) !== JSON.stringify(this.robots[name])) this.robots = { ...this.robots, [name]: parts }
       return
@@ -575,9 +575,13 @@ export class DiagramStore {
   }
 }
 
-/** Types of the requests and replies of a service. */
-function partTypes({ type }: Element): [string, string] {
-  return [`${type}_Request`, `${type}_Response`]
+/** Types of the requests and replies of a service, or of the goals and results of an action. */
+function partTypes({ kind, type }: Element): [string, string] {
+  return kind === 'action' ? [`${type}_Goal`, `${type}_Result`] : [`${type}_Request`, `${type}_Response`]
+}
+
+function isCalled({ kind }: Element): boolean {
+  return kind === 'service' || kind === 'action'
 }
 
 /** The name of a robot, program or Role by the id of its node. */
