@@ -91,7 +91,9 @@ def test_a_topic_calls_a_service_and_a_program_is_a_box(world: DiagramWorld, pag
 
 def test_a_field_is_sent_in_the_goals_of_an_action(world: DiagramWorld, page: Page) -> None:
     """The relay's own actions are not shown."""
-    robot = SmallRobot(world.relay, "feeder", {}, actions={"/feed": "float64 amount\n---\nstring words\n---\n"})
+    robot = SmallRobot(
+        world.relay, "feeder", {}, actions={"/feed": "float64 amount\n---\nstring words\n---\n"}
+    )
     world.relay.cli("right", "grant", "ann", "feeder", "operator")
     robot.comes()
     try:
