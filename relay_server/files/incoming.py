@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 
 from relay_protocol.limits import MIB
-from relay_server.files.storage import FileStorage, free_bytes, sync_folder
+from relay_server.files.storage import FileStorage, free_bytes, hash_of_stored, sync_folder
 
 
 class DiskFull(OSError):
@@ -88,7 +88,7 @@ class IncomingFolder:
 
         :raises OSError: it can't be stored, or has changed since it was hashed
         """
-        if storage.size(key) == size:
+        if storage.size(key) == size and hash_of_stored(storage, key) == sha256:
             return
         self.delete(key)
         file = self.open(key, size)

@@ -291,8 +291,11 @@ class FileService:
         :raises Unavailable: the database or the storage does not answer; it is tried again later
         """
         await self._files.uploads.end(file.id)
-        if not await self._database.write(queries.begin_file_removal, file.id, self._wall()):
-            return
+        if await self._database.write(queries.begin_file_removal, file.id, self._wall()):
+            await self._remove_begun(file)
+
+    async def _remove_begun(self, file: FileRecord) -> None:
+        """Delete a file whose row says that it is removed."""
         # An upload may have begun before the row said that the file is removed.
         await self._files.uploads.end(file.id)
         await self._delete_contents(file.id)
@@ -344,7 +347,9 @@ class FileService:
                 if self._files.uploads.is_active(file.id):
                     continue
                 try:
-                    await self.remove(file)
+                    # An upload may have gone on since the list was read, and be stored and confirmed by now.
+                    if await self._database.write(queries.begin_purge, file.id, before, self._wall()):
+                        await self._remove_begun(file)
                 except Unavailable as error:
                     failed = error
         if failed is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import threading
@@ -12,6 +13,7 @@ from typing import Generic, Protocol, TypeVar
 
 from twisted.internet.defer import Deferred
 
+from relay_protocol.limits import MIB
 from relay_server.common.concurrency import shield
 from relay_server.common.database import BoundedThreadPool
 
@@ -79,6 +81,21 @@ class StoredContent(Protocol):
 
     def close(self) -> None:
         """End reading."""
+
+
+def hash_of_stored(storage: FileStorage, key: str) -> str:
+    """SHA-256 of contents that are stored, hexadecimal.
+
+    :raises OSError: they can't be read
+    """
+    digest, offset, content = hashlib.sha256(), 0, storage.open(key)
+    try:
+        while part := content.read(offset, MIB):
+            digest.update(part)
+            offset += len(part)
+    finally:
+        content.close()
+    return digest.hexdigest()
 
 
 class ContentReader:

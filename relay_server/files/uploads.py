@@ -22,7 +22,7 @@ from relay_protocol.limits import FILE_NAME
 from relay_server.common.database import AsyncDatabase, BoundedThreadPool
 from relay_server.events.bus import EventBus
 from relay_server.files.incoming import DiskFull, IncomingFile, IncomingFolder, WrongContents
-from relay_server.files.storage import FileStorage, open_in_thread
+from relay_server.files.storage import FileStorage, hash_of_stored, open_in_thread
 
 T = TypeVar("T")
 
@@ -160,8 +160,12 @@ class Uploads:
         :raises UploadRefused: it can't be opened
         """
         stored = await self.on_disk(self._storage.size, str(file.id))
-        if stored == file.size:
-            # The relay died between storing the contents, which were checked before, and listing them.
+        # The relay may have died between storing the contents and listing them. Or the storage has a file of this
+        # number that the database does not know, because an older state of it was restored.
+        if (
+            stored == file.size
+            and await self.on_disk(hash_of_stored, self._storage, str(file.id)) == file.sha256
+        ):
             await self._listed(file)
             await self.on_disk(self._incoming.delete, str(file.id))
             return None

@@ -170,7 +170,7 @@ class DaskEngine:
         """Run a call on the worker that has the most room; those with labels are spared."""
         name, version = call.call.name, call.call.version
         able = [each for each in self._workers.values() if each.can_run(name, version, call.labels)]
-        worker = min(able, key=self._load, default=None)
+        worker = min(able, key=lambda each: self._load(each, call.labels), default=None)
         run = DaskRun(self, call, worker)
         if worker is None:
             words = "no worker that has it is connected any more; it did not run"
@@ -226,19 +226,21 @@ class DaskEngine:
 
     def _room(self, worker: DaskWorker, function: FunctionDescription) -> int:
         """How many calls of a function it can begin now."""
-        if not _can_run(worker, function):
-            return 0
+        return self._free_calls(worker, function.labels) if _can_run(worker, function) else 0
+
+    def _free_calls(self, worker: DaskWorker, labels: Mapping[str, float]) -> int:
+        """How many calls it can begin now that each take so much of what it has."""
         runs = self._of(worker)
         room = worker.slots - len(runs)
-        for name, value in function.labels.items():
+        for name, value in labels.items():
             taken = sum(run.call.labels.get(name, 0.0) for run in runs)
             room = min(room, int((worker.labels[name] - taken) / value) if value > 0 else room)
         return max(0, room)
 
-    def _load(self, worker: DaskWorker) -> tuple[bool, int, float]:
-        """Order of workers for a call."""
+    def _load(self, worker: DaskWorker, labels: Mapping[str, float]) -> tuple[bool, int, float]:
+        """Order of workers for a call that needs these labels."""
         running = len(self._of(worker))
-        return running >= worker.slots, len(worker.labels), running / max(1, worker.slots)
+        return self._free_calls(worker, labels) == 0, len(worker.labels), running / max(1, worker.slots)
 
     def _found(self, connected: bool, workers: dict[str, DaskWorker]) -> None:
         """The workers have been listed."""

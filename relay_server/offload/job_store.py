@@ -72,9 +72,14 @@ class JobStore:
         await self._database.write(queries.update_job, job_id, **values)
 
     async def begin_run(self, job: Job) -> bool:
-        """A job is about to run; false if it has ended or is gone."""
+        """A job is about to run; false if it has ended or is gone, or another relay has taken it over."""
         return await self._database.write(
-            queries.update_unfinished_job, job.id, state="running", started=job.started, attempts=job.attempts
+            queries.update_unfinished_job,
+            job.id,
+            self._relay,
+            state="running",
+            started=job.started,
+            attempts=job.attempts,
         )
 
     async def end(self, job_id: str, end: JobEnd) -> None:
@@ -82,6 +87,7 @@ class JobStore:
         await self._database.write(
             queries.update_unfinished_job,
             job_id,
+            self._relay,
             state=end.state,
             code=end.outcome.code,
             error=end.outcome.error,

@@ -94,7 +94,11 @@ class Job:
 
     def restore(self, record: FunctionJobRecord) -> None:
         """Take over the state that was stored."""
-        self.attempts, self.started = record.attempts, record.started
+        self.attempts, self.started, self.state = (
+            record.attempts,
+            record.started,
+            cast(JobState, record.state),
+        )
         if record.ended is not None:
             outcome = Outcome(record.result, record.code, record.error, record.run_seconds or 0.0)
             self.end = JobEnd(cast(JobState, record.state), outcome, record.ended, record.expires)

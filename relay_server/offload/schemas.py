@@ -58,7 +58,7 @@ class JobStatus(msgspec.Struct, frozen=True, kw_only=True):
     :param progress: 0 to 1, as the function reports it
     :param text: of the progress
     :param code: why there is no result: `error`, `timeout`, `memory`, `crashed`, `invalid`, `invalid_result`,
-        `too_large`, `deadline`, `lost`
+        `too_large`, `deadline`, `cancelled`, `lost`
     :param error: the same in words
     :param created: Unix seconds
     :param started: of the latest attempt

@@ -44,9 +44,6 @@ MAX_BYTES_OF_OWNER = 64 * MIB
 DEADLINE_SECONDS = 60.0
 """Default time for a call, with waiting for a worker."""
 
-GRACE_SECONDS = 5.0
-"""A call without any end so long after its deadline counts as lost."""
-
 DESCRIBE_SECONDS = 30.0
 """Age at which the functions of the workers are asked for again."""
 
@@ -160,6 +157,7 @@ class FunctionService:
             job.attempts = record.attempts
             ran = record.state == "running"
             if not ran or (function.repeatable and record.attempts < ATTEMPTS):
+                job.state = "queued"
                 self._admit(job)
                 return
             words = (
@@ -517,10 +515,10 @@ class FunctionService:
             self._finish(job, Outcome(code="lost", error=str(error)))
         finally:
             self._starting -= 1
-        if job.end is not None or self._closed:
-            self._dispatch()
-        else:
+        if job.end is None and not self._closed:
             self._run(job)
+        # While it was being marked, it counted against all workers.
+        self._dispatch()
 
     def _run(self, job: Job) -> None:
         function = job.function

@@ -6,6 +6,7 @@ from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
 
 import msgspec
+from twisted.internet.defer import CancelledError
 
 from relay_protocol import json_cost, jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, SwitchboardError
@@ -63,7 +64,13 @@ class FunctionRosServices:
         job = await self._service.submit(
             owner, name, arguments, version=version or None, payer=payer, keep=timeout <= 0
         )
-        await self._service.wait(job, timeout)
+        try:
+            await self._service.wait(job, timeout)
+        except CancelledError:
+            # The client has left and does not know the job.
+            if not job.stored:
+                self._service.cancel(job)
+            raise
         if not job.over:
             await self._service.keep(job)
         return _state(job)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from concurrent.futures import Future
@@ -45,6 +46,7 @@ class Cloud:
 
     def __init__(self, folder: Path | None = None) -> None:
         self._folder = folder
+        self._process = os.getpid()
         self._lock = threading.Lock()
         self._connection: FunctionConnection | None = None
         self._dialled: Future[FunctionConnection] | None = None
@@ -149,6 +151,10 @@ class Cloud:
 
     def _connected(self, seconds: float) -> FunctionConnection:
         """The link; it is dialled in a thread of its own, once for all callers, as a lookup of a name can take long."""
+        if self._process != os.getpid():
+            # The thread of the link has stayed in the process from which this one was forked.
+            self._process, self._lock = os.getpid(), threading.Lock()
+            self._connection = self._dialled = None
         with self._lock:
             if self._connection is not None and self._connection.open:
                 return self._connection

@@ -71,7 +71,8 @@ class Device:
             state = msgspec.json.decode((folder / STATE_FILE).read_bytes(), type=DeviceState)
         except (OSError, ValueError, RecursionError):
             return None
-        return state if self._wall() - state.at <= MAX_AGE else None
+        # One from the future is not new either: the clock was set back, as on a robot whose clock has no battery.
+        return state if abs(self._wall() - state.at) <= MAX_AGE else None
 
     def where(self) -> Where:
         """Where the robot's settings want functions to run; ``auto`` if the state is not known."""

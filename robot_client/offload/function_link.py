@@ -133,12 +133,12 @@ class FunctionConnection:
             if not self.open:
                 raise Unavailable(f"the link to the relay is lost ({self._reason})")
             overtaken = [old for old in self._waiting if newest and old.newest == newest]
+            waiting = sum(len(each.body) for each in self._waiting if each not in overtaken)
+            if waiting and waiting + len(body) > WAITING_BYTES:
+                raise Unavailable(f"{waiting} bytes of calls wait for the slow link to the relay already")
             for each in overtaken:
                 self._waiting.remove(each)
                 del self._replies[each.number]
-            waiting = sum(len(each.body) for each in self._waiting)
-            if waiting and waiting + len(body) > WAITING_BYTES:
-                raise Unavailable(f"{waiting} bytes of calls wait for the slow link to the relay already")
             self._waiting.append(reply)
             self._replies[reply.number] = reply
         for each in overtaken:
@@ -198,8 +198,9 @@ class FunctionConnection:
                 selector.register(self._socket, selectors.EVENT_READ)
                 while self.open:
                     self._step(selector)
-        except (OSError, SwitchboardError) as error:
-            self._reason = str(error)
+        except Exception as error:
+            self._reason = str(error) or type(error).__name__
+        # After an error of any kind: a link that stays open without its thread would answer nothing.
         self.close(self._reason)
         self._socket.close()
         self._woken.close()

@@ -131,6 +131,23 @@ def begin_file_removal(s: Session, file_id: int, now: float) -> bool:
     return _set_state(s, file_id, (INCOMING, STORED, REMOVING), REMOVING, now)
 
 
+def begin_purge(s: Session, file_id: int, incoming_before: float, now: float) -> bool:
+    """The contents of a file are about to be deleted; false if it is none of :func:`files_to_delete` any more."""
+    changed = (
+        update(StoredFile)
+        .where(StoredFile.id == file_id, _to_delete(incoming_before))
+        .values(state=REMOVING, state_since=now)
+        .returning(StoredFile.id)
+    )
+    return s.scalar(changed) is not None
+
+
+def _to_delete(incoming_before: float) -> ColumnElement[bool]:
+    orphan = ~select(Robot.id).where(Robot.id == StoredFile.robot_id).exists()
+    stale = and_(StoredFile.state == INCOMING, StoredFile.state_since < incoming_before)
+    return or_(StoredFile.state == REMOVING, stale, orphan)
+
+
 def _set_state(s: Session, file_id: int, before: Collection[str], state: str, now: float) -> bool:
     changed = (
         update(StoredFile)
@@ -227,9 +244,7 @@ def files_to_delete(s: Session, incoming_before: float, after: int, limit: int) 
 
     :param after: id of the file before the first
     """
-    orphan = ~select(Robot.id).where(Robot.id == StoredFile.robot_id).exists()
-    stale = and_(StoredFile.state == INCOMING, StoredFile.state_since < incoming_before)
-    query = select(*_COLUMNS).where(or_(StoredFile.state == REMOVING, stale, orphan), StoredFile.id > after)
+    query = select(*_COLUMNS).where(_to_delete(incoming_before), StoredFile.id > after)
     return fetch_all(s, FileRecord, query.order_by(StoredFile.id).limit(limit))
 
 

@@ -44,9 +44,9 @@ def update_job(s: Session, /, job_id: str, **values: Any) -> None:
     s.execute(update(FunctionJob).where(FunctionJob.id == job_id).values(**values))
 
 
-def update_unfinished_job(s: Session, /, job_id: str, **values: Any) -> bool:
-    """Set columns of a job that waits or runs; false if it has ended or was removed."""
-    unfinished = FunctionJob.id == job_id, FunctionJob.state.in_(_UNFINISHED)
+def update_unfinished_job(s: Session, /, job_id: str, relay: str, **values: Any) -> bool:
+    """Set columns of a job that waits or runs; false if it has ended, was removed, or is another relay's by now."""
+    unfinished = FunctionJob.id == job_id, FunctionJob.relay == relay, FunctionJob.state.in_(_UNFINISHED)
     changed = update(FunctionJob).where(*unfinished).values(**values).returning(FunctionJob.id)
     return s.scalar(changed) is not None
 

@@ -22,7 +22,7 @@ class DeviceTopic:
     """
 
     def __init__(self, node: Any) -> None:
-        # Imported here, as a robot without these messages has a daemon, too.
+        # Imported here, as a robot without these messages has a daemon, too; it has no such topic.
         from diagnostic_msgs.msg import DiagnosticArray
 
         self._node = node

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from importlib import metadata
+from importlib.util import find_spec
 from typing import Any
 
 import rclpy
@@ -367,7 +368,7 @@ class Ros2Platform(Platform):
 
     def publish_device(self, state: link.DeviceReport) -> None:
         self._device_state = state
-        if self._node is None:
+        if self._node is None or find_spec("diagnostic_msgs") is None:
             return
         if self._device_topic is None:
             self._device_topic = DeviceTopic(self._nodes.for_device())

@@ -146,3 +146,47 @@ def test_contents_of_a_file_that_another_relay_has_removed_are_deleted(stored: S
     with stored.world.database.begin() as session:
         queries.remove_file(session, file.id)
     assert notified() == 0
+
+
+class SlowPool(StepPool):
+    """Its first work waits."""
+
+    def __init__(self, steps: Steps) -> None:
+        super().__init__(steps)
+        self.go_on: Deferred[None] | None = Deferred()
+
+    async def run(self, work: Any, *args: Any, **more: Any) -> Any:
+        waiting, self.go_on = self.go_on, None
+        if waiting is not None:
+            self.begun = waiting
+            await waiting
+        return await super().run(work, *args, **more)
+
+
+def test_an_upload_that_goes_on_during_a_purge_stays(tmp_path: Path) -> None:
+    """It is stored and confirmed between the list of what is to be deleted and its turn."""
+    world = FileWorld(tmp_path)
+    paths = [world.write(name, CONTENT) for name in ("a.bag", "b.bag")]
+    world.start_relay(Steps(6, True, world.cut))
+    world.run(3)
+    world.start_relay(Steps())
+    service = Service(world)
+    pool: Any = SlowPool(world.relay_steps)
+    core = FileCore(pool, world.incoming_folder, world.content, world.uploads, world.links)
+    database: Any = world.store
+    purging = FileService(service.service._sessions, core, database, EventBus(), 0, lambda: LATER)
+    done: list[object] = []
+    Deferred.fromCoroutine(purging.purge()).addBoth(done.append)
+    assert done == []
+    world.cut()
+    world.start_robot(Steps())
+    world.run(20)
+    confirmed = {each.name for each in world.stored()}
+    assert confirmed
+    pool.begun.callback(None)
+    world.run(60)
+    assert done == [None]
+    stored = {each.name: world.read(each) for each in world.stored()}
+    assert stored.keys() >= confirmed
+    for path in paths:
+        assert path.exists() or stored[f"bags/{path.name}"] == CONTENT

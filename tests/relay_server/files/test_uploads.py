@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -278,3 +279,18 @@ def test_contents_of_many_files_are_remembered_in_batches(world: FileWorld) -> N
     assert len(world.stored()) == 600
     assert most <= 256 + 8
     assert list(world.folder.iterdir()) == []
+
+
+def test_contents_of_another_file_under_the_same_number_are_not_confirmed(tmp_path: Path) -> None:
+    """The database was restored, and is older than the storage: it gives a number again. Both files are of one size."""
+    (tmp_path / "before").mkdir()
+    (tmp_path / "after").mkdir()
+    before, after = FileWorld(tmp_path / "before"), FileWorld(tmp_path / "after")
+    before.write("a.log", b"A" * 1000)
+    before.run(10)
+    before.check("a.log", b"A" * 1000)
+    shutil.copytree(before.data, after.data, dirs_exist_ok=True)
+    path = after.write("b.log", b"B" * 1000)
+    after.run(15)
+    assert not path.exists()
+    after.check("b.log", b"B" * 1000)

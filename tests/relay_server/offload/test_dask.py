@@ -17,7 +17,7 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import Invalid, Unavailable
 from relay_protocol.functions import FunctionDescription, decode_value, encode_value
-from relay_server.offload.dask_engine import DaskEngine
+from relay_server.offload.dask_engine import DaskEngine, DaskRun, DaskWorker
 from relay_server.offload.dask_worker import security_of
 from relay_server.offload.engine import EngineCall
 from relay_server.offload.runner import Outcome, WorkerCall
@@ -212,3 +212,40 @@ def test_a_scheduler_over_a_network_needs_certificates(
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:8786", "tcp://localhost:8786", "tcp://[::1]:8786"])
 def test_a_scheduler_on_this_machine_needs_none(address: str) -> None:
     assert security_of(address, ("", "", "")) is None
+
+
+def test_a_call_goes_to_a_worker_whose_labels_are_free() -> None:
+    """Not to one that has more free processes, and whose only GPU is taken."""
+    gpu, plain = (
+        FunctionDescription(
+            name=name, version=1, text="", arguments={}, result={}, repeatable=False, seconds=10.0, memory_mib=1,
+            labels=labels,
+        )
+        for name, labels in (("gpu", {"GPU": 1.0}), ("plain", {}))
+    )  # fmt: skip
+    engine = DaskEngine(reactor, "tcp://127.0.0.1:1")
+    known = {("gpu", 1): gpu, ("plain", 1): plain}
+    for name in ("a", "b"):
+        engine._workers[name] = DaskWorker(
+            id=name,
+            address=name,
+            name=name,
+            host="here",
+            slots=4,
+            labels={"GPU": 1.0},
+            functions=known,
+            problems=[],
+        )
+    for function, worker in ((gpu, "a"), (plain, "b"), (plain, "b")):
+        call = EngineCall(
+            call=WorkerCall(
+                number=1, name=function.name, version=1, arguments=b"", memory_mib=1, max_result=1
+            ),
+            seconds=10.0,
+            labels=function.labels,
+        )
+        run = DaskRun(engine, call, engine._workers[worker])
+        engine._runs[run.id] = run, lambda done, text: None
+    assert engine.free(gpu)
+    assert min(engine._workers.values(), key=lambda each: engine._load(each, gpu.labels)).name == "b"
+    assert min(engine._workers.values(), key=lambda each: engine._load(each, {})).name == "a"

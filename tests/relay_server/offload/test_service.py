@@ -21,10 +21,10 @@ from relay_server.offload import service as module
 from relay_server.offload.job_store import KeyInUse, TooManyJobs
 from relay_server.offload.jobs import JobOwner
 from relay_server.offload.robot_link import MAX_LINKS, FunctionLinks
-from relay_server.offload.runner import Outcome
+from relay_server.offload.runner import Outcome, WorkerFunctions
 from relay_server.offload.service import DESCRIBE_SECONDS, MAX_OF_OWNER, SAVE_SECONDS
 from relay_server.robots.connection import LinkTiming, RobotConnection
-from tests.worlds.function_service import FunctionWorld, MemoryEngine, result
+from tests.worlds.function_service import FunctionWorld, MemoryEngine, described, result
 from tests.worlds.robot_links import Transport
 
 
@@ -336,3 +336,53 @@ def test_a_key_of_a_call_is_for_one_version_and_robot(world: FunctionWorld, othe
     assert user_job(world, key="k").id == job.id
     with pytest.raises(KeyInUse):
         user_job(world, key="k", **other)
+
+
+class TwoWorkers(MemoryEngine):
+    """One has ``move``, the other ``look``; each runs one call at a time."""
+
+    async def describe(self) -> WorkerFunctions:
+        return WorkerFunctions([described(1), msgspec.structs.replace(described(1), name="look")])
+
+    def free(self, function: Any, *, reserved: int = 0) -> bool:
+        mine = [each for each in self.runs if each.call.call.name == function.name]
+        return sum(not each.outcome.called for each in mine) + reserved < 1
+
+
+def test_a_job_for_one_worker_does_not_wait_for_what_begins_on_another(world: FunctionWorld) -> None:
+    world.service = world.new_service(TwoWorkers())
+    engine: Any = world.service.engine
+    result(Deferred.fromCoroutine(world.service.functions(world.ann)))
+    world.database.hold = True
+    world.submit(keep=True)
+    world.database.release()
+    assert [each.call.call.name for each in engine.runs] == ["move"]
+    engine.runs[0].outcome.callback(Outcome(value=b"\x01"))
+    world.database.hold = True
+    world.submit(keep=True)
+    world.database.release()
+    world.database.hold = True
+    other = result(Deferred.fromCoroutine(world.service.submit(world.rover, "look", b"\x80")))
+    world.database.release()
+    assert other.state == "running"
+
+
+def test_a_job_that_another_relay_has_taken_over_is_not_begun(world: FunctionWorld) -> None:
+    """This one was cut off from the others, but not from the database."""
+    engine = MemoryEngine()
+    engine.slots = 0
+    one, two = world.new_service(engine, "one"), world.new_service(MemoryEngine(), "two")
+    world.service = one
+    job = result(world.submit(keep=True))
+    result(Deferred.fromCoroutine(two.take_over(["two"])))
+    begun: Any = two.engine
+    assert len(begun.runs) == 1
+    engine.slots = 1
+    one._dispatch()
+    assert engine.runs == []
+    assert job.over
+    assert world.state(job.id) == "running"
+    shown = result(Deferred.fromCoroutine(one.job(world.rover, job.id)))
+    assert shown.state == "running"
+    begun.runs[0].outcome.callback(Outcome(value=b"\x01"))
+    assert world.state(job.id) == "done"

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
 
 from relay_protocol.errors import Invalid, Refused
 from relay_server.relay_node.functions import FunctionRosServices
@@ -40,3 +40,15 @@ def test_a_token_for_one_robot_does_not_reach_a_job_without_a_robot(tmp_path: Pa
     assert ask(world, world.ann, "/relay/function_job", job=job.id)["state"] == "running"
     begun = ask(world, limited, "/relay/call_function", function="move", timeout=0)
     assert ask(world, limited, "/relay/function_job", job=begun["job"])["state"] == "running"
+
+
+def test_a_call_whose_client_leaves_is_cancelled(tmp_path: Path) -> None:
+    world = FunctionWorld(tmp_path)
+    client: Any = SimpleNamespace(permit=SimpleNamespace(principal=world.ann), robot=world.rights.robot)
+    call = FunctionRosServices(world.service).handlers()["/relay/call_function"]
+    waiting = Deferred.fromCoroutine(call(client, {"function": "move", "timeout": 30}))
+    (run,) = world.engine.runs
+    waiting.addErrback(lambda failure: failure.trap(CancelledError))
+    waiting.cancel()
+    assert run.outcome.called
+    assert world.service.engine.free(None)  # type: ignore[arg-type]

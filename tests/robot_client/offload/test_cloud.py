@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,8 +17,9 @@ import pytest
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from relay_protocol.function_link import FunctionReply
 from relay_protocol.functions import CallFailed
-from robot_client.offload import function_link, offload
+from robot_client.offload import Device, DeviceState, function_link, offload
 from robot_client.offload.cloud import Cloud, result_of
+from robot_client.offload.device import publish
 from robot_client.offload.function_link import FunctionConnection, Overtaken
 from tests.worlds.waiting import wait_for
 
@@ -154,15 +157,16 @@ def test_calls_of_two_cameras_do_not_replace_each_other(slow: tuple[Cloud, socke
     client, _ = slow
     frame = bytes(1_000_000)
     with ThreadPoolExecutor(4) as pool:
-        first = pool.submit(client.call, "look", timeout=1, newest="front", frame=frame)
+        first = pool.submit(client.call, "look", timeout=60, newest="front", frame=frame)
         wait_for("the first is being sent", lambda: client._connection and client._connection._replies)
-        front = pool.submit(client.call, "look", timeout=1, newest="front", frame=frame)
+        front = pool.submit(client.call, "look", timeout=60, newest="front", frame=frame)
         wait_for("the second waits", lambda: client._connection and client._connection._waiting)
-        rear = pool.submit(client.call, "look", timeout=1, newest="rear", frame=frame)
+        rear = pool.submit(client.call, "look", timeout=60, newest="rear", frame=frame)
         wait_for("both wait", lambda: client._connection and len(client._connection._waiting) == 2)
-        newer = pool.submit(client.call, "look", timeout=1, newest="front", frame=frame)
+        newer = pool.submit(client.call, "look", timeout=60, newest="front", frame=frame)
         with pytest.raises(Overtaken):
             front.result(60)
+        client.close()
         for each in (first, rear, newer):
             with pytest.raises((CallFailed, Unavailable)):
                 each.result(60)
@@ -177,3 +181,55 @@ def test_a_time_that_the_relay_would_refuse_is_refused_before(seconds: float) ->
         Cloud().submit("look", deadline=seconds)
     with pytest.raises(Invalid, match="the key has 300 characters"):
         Cloud().submit("look", key="x" * 300)
+
+
+def test_an_older_frame_stays_if_there_is_no_room_for_the_newer(slow: tuple[Cloud, socket.socket]) -> None:
+    """Else neither would be sent, and the caller of the older would wait for nothing."""
+    client, _ = slow
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(client.call, "look", timeout=60, newest=True, frame=bytes(1_000_000))
+        wait_for("the first is being sent", lambda: client._connection and client._connection._replies)
+        older = pool.submit(client.call, "look", timeout=60, newest=True, frame=bytes(1_000_000))
+        wait_for("the second waits", lambda: client._connection and client._connection._waiting)
+        with pytest.raises(Unavailable, match="bytes of calls wait"):
+            for _ in range(70):
+                client.submit("look", frame=bytes(1_000_000))
+        with pytest.raises(Unavailable, match="bytes of calls wait"):
+            client.call("look", timeout=60, newest=True, frame=bytes(2_000_000))
+        client.close()
+        for each in (first, older):
+            with pytest.raises((CallFailed, Unavailable)) as caught:
+                each.result(60)
+            assert not isinstance(caught.value, Overtaken)
+
+
+def test_a_link_whose_thread_fails_is_closed(slow: tuple[Cloud, socket.socket]) -> None:
+    """By any fault; calls fail at once, and the next one dials."""
+    client, other = slow
+    call = client.submit("look")
+    connection = client._connection
+    assert connection is not None
+    connection._link = None  # type: ignore[assignment]
+    other.send(b"x")
+    with pytest.raises(SwitchboardError, match="lost"):
+        call.id(60)
+    assert not connection.open
+
+
+def test_a_forked_program_has_a_link_of_its_own(slow: tuple[Cloud, socket.socket]) -> None:
+    client, _ = slow
+    client.submit("look")
+    before = client._connection
+    client._process += 1
+    client._lock.acquire()
+    client.submit("look")
+    assert client._process == os.getpid()
+    assert client._connection is not None
+    assert before is not None
+
+
+@pytest.mark.parametrize(("at", "critical"), [(900.0, True), (1100.0, True), (819.0, False), (1181.0, False)])
+def test_a_state_counts_while_it_is_new(tmp_path: Path, at: float, critical: bool) -> None:
+    """Also on a robot whose clock was set back."""
+    publish(tmp_path, DeviceState(at, {"cpu": True}))
+    assert Device(tmp_path, lambda: 1000.0).critical("cpu") is critical

@@ -7496,7 +7496,7 @@ export interface components {
             progress: number;
             /** @description of the progress */
             text: string;
-            /** @description why there is no result: `error`, `timeout`, `memory`, `crashed`, `invalid`, `invalid_result`, `too_large`, `deadline`, `lost` */
+            /** @description why there is no result: `error`, `timeout`, `memory`, `crashed`, `invalid`, `invalid_result`, `too_large`, `deadline`, `cancelled`, `lost` */
             code: string;
             /** @description the same in words */
             error: string;
