@@ -196,6 +196,8 @@ def test_an_older_frame_stays_if_there_is_no_room_for_the_newer(slow: tuple[Clou
                 client.submit("look", frame=bytes(1_000_000))
         with pytest.raises(Unavailable, match="bytes of calls wait"):
             client.call("look", timeout=60, newest=True, frame=bytes(2_000_000))
+        assert client._connection is not None
+        assert any(each.newest for each in client._connection._waiting)
         client.close()
         for each in (first, older):
             with pytest.raises((CallFailed, Unavailable)) as caught:
