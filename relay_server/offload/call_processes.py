@@ -5,15 +5,18 @@ The embedded engine has them on the relay's machine, and ``switchboard worker`` 
 
 from __future__ import annotations
 
+import fcntl
 import multiprocessing
+import os
 import shutil
 import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from concurrent.futures import TimeoutError as FutureTimeout
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import msgspec
 from pebble import ProcessExpired, ProcessPool
@@ -24,7 +27,7 @@ from relay_server.offload.runner import (
     WorkerCall,
     WorkerFunctions,
     describe_functions,
-    end_groups,
+    end_left,
     run_call,
     start_process,
 )
@@ -44,7 +47,9 @@ class CallProcesses:
     def __init__(self, processes: int, folder: Path | None = None) -> None:
         self._processes = processes
         self._folder = folder
-        self._sockets = Path(tempfile.mkdtemp(prefix="switchboard-"))
+        _remove_abandoned()
+        self._sockets = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        self._owner = _lock(self._sockets)
         self.progress_socket = str(self._sockets / "progress")
         self._lock = threading.Lock()
         self._pool: ProcessPool | None = None
@@ -67,8 +72,9 @@ class CallProcesses:
         if pool is not None:
             pool.stop()
             pool.join()
-            end_groups(self._sockets)
+            end_left(self._sockets)
         shutil.rmtree(self._sockets, ignore_errors=True)
+        self._owner.close()
 
     def _schedule(
         self, work: Callable[..., bytes], arguments: tuple[Any, ...], seconds: float
@@ -84,6 +90,31 @@ class CallProcesses:
                 )
             future: Future[bytes] = self._pool.schedule(work, args=arguments, timeout=seconds)
             return future
+
+
+_PREFIX = "switchboard-calls-"
+_OWNER = "owner"
+"""A file that is locked while the owner of a folder lives."""
+
+
+def _lock(folder: Path) -> IO[bytes]:
+    # It has its name only once it is locked.
+    file = (folder / f"{_OWNER}.new").open("wb")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    (folder / f"{_OWNER}.new").rename(folder / _OWNER)
+    return file
+
+
+def _remove_abandoned() -> None:
+    """End what functions have left of a relay or worker that was killed, and remove its folder."""
+    for each in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        # Anybody may make such a folder there.
+        if each.lstat().st_uid != os.getuid():
+            continue
+        with suppress(OSError), (each / _OWNER).open("rb") as owner:
+            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            end_left(each, long_ago=True)
+            shutil.rmtree(each, ignore_errors=True)
 
 
 def functions_of(body: bytes) -> WorkerFunctions:

@@ -2,7 +2,7 @@
 
 It runs in the processes of :mod:`relay_server.offload.call_processes`. A process runs one call at a time. What a
 function has started itself ends with its call: at its end as a child of the process, and if the process was killed as a
-member of its group.
+member of its group, or by the variable :data:`MARK` in its environment.
 """
 
 from __future__ import annotations
@@ -48,6 +48,9 @@ _PR_SET_CHILD_SUBREAPER = 36
 
 GROUP = "group-"
 """Files beside the progress socket have this and the number of a process, which leads a group."""
+
+MARK = "SWITCHBOARD_CALLS"
+"""Environment variable of what functions start: the folder of the progress socket, and the number of the process."""
 
 CHILD_SECONDS = 1.0
 """Longest time in which the children of a call are ended."""
@@ -117,10 +120,11 @@ def start_process(folder: str, progress_socket: str) -> None:
     libc = ctypes.CDLL(None)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
-    folder_of_groups = Path(progress_socket).parent
-    end_groups(folder_of_groups)
+    owned = Path(progress_socket).parent
+    end_left(owned)
     os.setpgid(0, 0)
-    (folder_of_groups / f"{GROUP}{os.getpid()}").touch()
+    os.environ[MARK] = _mark(owned, os.getpid())
+    (owned / f"{GROUP}{os.getpid()}").touch()
     for name in ONE_THREAD:
         os.environ.setdefault(name, "1")
     _socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -130,18 +134,32 @@ def start_process(folder: str, progress_socket: str) -> None:
     registry(folder)
 
 
-def end_groups(folder: Path) -> None:
-    """Kill what is left of the groups of processes that have ended.
+def end_left(folder: Path, *, long_ago: bool = False) -> None:
+    """Kill what the functions of processes that have ended have left.
 
     :param folder: of the progress socket
+    :param long_ago: whether all have ended, maybe long ago: their numbers may be those of others by now, so that groups
+        stay
     """
+    ended = set()
     for each in folder.glob(f"{GROUP}*"):
         leader = int(each.name.removeprefix(GROUP))
-        # While the leader lives, or the number is another process's, the group is none of ours to kill.
-        if not Path(f"/proc/{leader}").exists():
+        if not long_ago:
+            # While the leader lives, or the number is another process's, the group is none of ours to kill.
+            if Path(f"/proc/{leader}").exists():
+                continue
             with suppress(OSError):
                 os.killpg(leader, signal.SIGKILL)
-            each.unlink(missing_ok=True)
+        ended.add(f"{MARK}={_mark(folder, leader)}".encode())
+        each.unlink(missing_ok=True)
+    for process in Path("/proc").glob("[0-9]*") if ended else ():
+        with suppress(OSError):
+            if not ended.isdisjoint((process / "environ").read_bytes().split(b"\0")):
+                os.kill(int(process.name), signal.SIGKILL)
+
+
+def _mark(folder: Path, number: int) -> str:
+    return f"{folder}:{number}"
 
 
 def _end_children() -> None:

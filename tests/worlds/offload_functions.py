@@ -125,14 +125,15 @@ def report(steps: int, go_on: str) -> int:
 
 
 @function(seconds=30.0)
-def leave_child(number: str, forever: bool = False) -> int:
-    """Starts a process that goes on in a session of its own, and writes down the number of its child's.
+def leave_child(number: str, session: bool = True, forever: bool = False) -> int:
+    """Starts a process that goes on, and writes down the number of its child's.
 
     :param number: path of a file
+    :param session: whether it has a session of its own
     """
     pending = f"{number}.pending"
     script = f"sleep 600 & echo $! > '{pending}'; mv '{pending}' '{number}'; wait"
-    subprocess.Popen(["sh", "-c", script], start_new_session=not forever)
+    subprocess.Popen(["sh", "-c", script], start_new_session=session)
     while not Path(number).exists():
         time.sleep(0.01)
     while forever:

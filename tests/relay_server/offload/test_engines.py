@@ -126,17 +126,20 @@ def test_a_call_without_a_result_ends_with_a_reason_and_disturbs_no_other(
 
 @pytest_twisted.inlineCallbacks
 def test_what_a_function_has_started_ends_with_its_call(bench: Bench, tmp_path: Path) -> Any:
-    """Also what has left the group of its process; and when the call is killed, what has not."""
+    """In the group of its process, and in a session of its own; also when the call is killed."""
     number = value((yield bench.outcome("leave_child", number=str(tmp_path / "left"))))
     assert not Path(f"/proc/{number}").exists()
-    file = tmp_path / "killed"
-    outcome = yield bench.outcome("leave_child", number=str(file), forever=True, seconds=2.0)
-    assert outcome.code == "timeout"
-    number = int(file.read_text())
-    end = time.monotonic() + 60
-    while Path(f"/proc/{number}").exists():
-        assert time.monotonic() < end
-        yield deferLater(reactor, 0.05)
+    for session in (False, True):
+        file = tmp_path / f"killed {session}"
+        outcome = yield bench.outcome(
+            "leave_child", number=str(file), session=session, forever=True, seconds=2.0
+        )
+        assert outcome.code == "timeout"
+        number = int(file.read_text())
+        end = time.monotonic() + 60
+        while Path(f"/proc/{number}").exists():
+            assert time.monotonic() < end
+            yield deferLater(reactor, 0.05)
     assert value((yield bench.outcome("add", a=1))) == 2
 
 
