@@ -30,10 +30,28 @@ from relay_server.offload.runner import (
     end_left,
     run_call,
     start_process,
+    took_no_call,
 )
 
 DESCRIBE_SECONDS = 60.0
 """Longest time in which a new process loads the functions."""
+
+
+class CallFuture(Future[bytes]):
+    """A call, which a process may leave to the one that takes its place.
+
+    :ivar run: in the present process
+    :ivar wanted: whether it was not cancelled
+    """
+
+    run: Future[bytes]
+    wanted = True
+
+    def cancel(self) -> bool:
+        """End the call. The future fails when it has ended."""
+        self.wanted = False
+        self.run.cancel()
+        return True
 
 
 class CallProcesses:
@@ -52,6 +70,7 @@ class CallProcesses:
         self._owner = _lock(self._sockets)
         self.progress_socket = str(self._sockets / "progress")
         self._lock = threading.Lock()
+        self._stopped = False
         self._pool: ProcessPool | None = None
 
     def describe(self) -> Future[bytes]:
@@ -63,10 +82,31 @@ class CallProcesses:
 
         :param seconds: longest run
         """
-        return self._schedule(run_call, (msgspec.msgpack.encode(call),), seconds)
+        made = CallFuture()
+        self._begin(made, call, seconds)
+        return made
+
+    def _begin(self, future: CallFuture, call: WorkerCall, seconds: float) -> None:
+        future.run = self._schedule(run_call, (msgspec.msgpack.encode(call),), seconds)
+        future.run.add_done_callback(lambda run: self._done(future, call, seconds, run))
+        if not future.wanted:
+            future.run.cancel()
+
+    def _done(self, future: CallFuture, call: WorkerCall, seconds: float, run: Future[bytes]) -> None:
+        error = CancelledError() if run.cancelled() else run.exception()
+        if isinstance(error, ProcessExpired) and took_no_call(self._sockets, call.number):
+            if future.wanted and not self._stopped:
+                self._begin(future, call, seconds)
+                return
+            error = CancelledError()
+        if error is None:
+            future.set_result(run.result())
+        else:
+            future.set_exception(error)
 
     def stop(self) -> None:
         """Kill all processes, and wait for their ends."""
+        self._stopped = True
         with self._lock:
             pool, self._pool = self._pool, None
         if pool is not None:
@@ -108,13 +148,18 @@ def _lock(folder: Path) -> IO[bytes]:
 def _remove_abandoned() -> None:
     """End what functions have left of a relay or worker that was killed, and remove its folder."""
     for each in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        # Anybody may make such a folder there.
-        if each.lstat().st_uid != os.getuid():
-            continue
-        with suppress(OSError), (each / _OWNER).open("rb") as owner:
-            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            end_left(each, long_ago=True)
-            shutil.rmtree(each, ignore_errors=True)
+        with suppress(OSError):
+            # Anybody may make such a folder there.
+            if each.lstat().st_uid == os.getuid():
+                _remove_if_abandoned(each)
+
+
+def _remove_if_abandoned(folder: Path) -> None:
+    """:raises OSError: its owner lives, or has just made it"""
+    with (folder / _OWNER).open("rb") as owner:
+        fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        end_left(folder, long_ago=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def functions_of(body: bytes) -> WorkerFunctions:

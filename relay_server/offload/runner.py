@@ -52,6 +52,13 @@ GROUP = "group-"
 MARK = "SWITCHBOARD_CALLS"
 """Environment variable of what functions start: the folder of the progress socket, and the number of the process."""
 
+GROWTH_BYTES = 256 * MIB
+"""A process that has grown by more, or has more threads, gives way to a new one before its next call: functions have kept
+them. What the first call of each function leaves does not count, as the function may need it for all calls."""
+
+_LEFT_CALL = "left-"
+"""Files beside the progress socket have this and the number of a call that a process has left to a new one."""
+
 CHILD_SECONDS = 1.0
 """Longest time in which the children of a call are ended."""
 
@@ -108,6 +115,9 @@ class ProgressReport(msgspec.Struct, frozen=True, array_like=True):
 _registry: FunctionRegistry | None = None
 _socket: socket.socket | None = None
 _lock = threading.Lock()
+_usual_bytes = 0
+_usual_threads = 1
+_called: set[tuple[str, int]] = set()
 
 
 def start_process(folder: str, progress_socket: str) -> None:
@@ -116,7 +126,7 @@ def start_process(folder: str, progress_socket: str) -> None:
     :param folder: of further functions, or empty
     :param progress_socket: path of its owner's datagram socket
     """
-    global _socket
+    global _socket, _usual_bytes, _usual_threads
     libc = ctypes.CDLL(None)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
@@ -132,6 +142,7 @@ def start_process(folder: str, progress_socket: str) -> None:
     with suppress(OSError):
         _socket.connect(progress_socket)
     registry(folder)
+    _usual_bytes, _usual_threads = _data_bytes(), threading.active_count()
 
 
 def end_left(folder: Path, *, long_ago: bool = False) -> None:
@@ -206,11 +217,36 @@ def describe_functions() -> bytes:
 
 def run_call(body: bytes) -> bytes:
     """Carry out a :class:`WorkerCall`; returns an :class:`Outcome`, both as MessagePack. It raises nothing."""
+    global _usual_bytes, _usual_threads
     call = msgspec.msgpack.decode(body, type=WorkerCall)
-    began = time.monotonic()
+    if _data_bytes() > _usual_bytes + GROWTH_BYTES or threading.active_count() > _usual_threads:
+        _leave(call.number)
+    began, before = time.monotonic(), _data_bytes()
     outcome = _run(call, _to_socket(call.number))
     _end_children()
+    if (call.name, call.version) not in _called:
+        _called.add((call.name, call.version))
+        _usual_bytes += max(0, _data_bytes() - before)
+        _usual_threads = max(_usual_threads, threading.active_count())
     return msgspec.msgpack.encode(msgspec.structs.replace(outcome, seconds=time.monotonic() - began))
+
+
+def _leave(number: int) -> None:
+    """End this process before a call, which a new one begins in its place."""
+    (Path(os.environ[MARK].rpartition(":")[0]) / f"{_LEFT_CALL}{number}").touch()
+    os._exit(os.EX_TEMPFAIL)
+
+
+def took_no_call(folder: Path, number: int) -> bool:
+    """Whether a process that has ended has left its call to a new one; to be asked once.
+
+    :param folder: of the progress socket
+    """
+    try:
+        (folder / f"{_LEFT_CALL}{number}").unlink()
+    except OSError:
+        return False
+    return True
 
 
 def _run(call: WorkerCall, report: Reporter) -> Outcome:

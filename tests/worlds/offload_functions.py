@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,18 @@ def unsendable() -> Any:
 def large_result(size: int) -> bytes:
     """Returns this many bytes."""
     return bytes(size)
+
+
+_kept: list[Any] = []
+
+
+@function()
+def keep(mib: int, thread: bool = False) -> list[int]:
+    """Keeps memory, or a thread; returns how much is kept in this process, MiB, and the process."""
+    _kept.append(bytes(mib << 20))
+    if thread:
+        threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
+    return [sum(map(len, _kept)) >> 20, os.getpid()]
 
 
 @function(seconds=30.0)

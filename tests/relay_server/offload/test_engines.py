@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -122,6 +123,26 @@ def test_a_call_without_a_result_ends_with_a_reason_and_disturbs_no_other(
     assert words in outcome.error
     assert value((yield beside)) == 0.3
     assert value((yield bench.outcome("add", a=1))) == 2
+
+
+@pytest_twisted.inlineCallbacks
+def test_a_process_whose_functions_keep_memory_gives_way_to_a_new_one(bench: Bench) -> Any:
+    """Before its next call, which the new one carries out. So the limits of many calls do not add up."""
+    kept = []
+    for _ in range(12):
+        kept.append(value((yield bench.outcome("keep", mib=90, memory_mib=150))))
+    processes = {process for _, process in kept}
+    assert len(processes) > 2
+    # The first call of a process does not count; the processes share the calls.
+    assert max(mib for mib, _ in kept) <= 5 * 90
+
+
+@pytest_twisted.inlineCallbacks
+def test_a_process_in_which_a_function_has_left_a_thread_gives_way_to_a_new_one(bench: Bench) -> Any:
+    seen: Counter[int] = Counter()
+    for _ in range(6):
+        seen[value((yield bench.outcome("keep", mib=0, thread=True)))[1]] += 1
+    assert max(seen.values()) <= 2
 
 
 @pytest_twisted.inlineCallbacks
