@@ -12,7 +12,14 @@ from relay_server.http.openapi.operation import PROBLEM
 _VERSION = "3.1.1"
 _DEFINITION = "#/$defs/"
 _COMPONENT = "#/components/schemas/"
-_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9._-]")
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9-]")
+_HEADERS = [
+    {"name": name, "in": "header", "schema": {"type": "string"}, "description": words}
+    for name, words in (
+        ("Prefer", "`wait=` seconds to wait for the result, or `respond-async` (RFC 7240)"),
+        ("Idempotency-Key", "a repeated call with the same key is carried out once"),
+    )
+]
 
 _PROBLEM = {
     "description": "problem details (RFC 9457); `code` says why a call has no result",
@@ -85,6 +92,7 @@ def _call(function: FunctionDescription, components: dict[str, Any]) -> dict[str
         "operationId": function.name,
         "summary": function.text.partition("\n")[0] or function.name,
         "description": function.text,
+        "parameters": _HEADERS,
         "requestBody": {"required": True, "content": {"application/json": {"schema": body}}},
         "responses": {
             "200": {"description": "the result", "content": {"application/json": {"schema": result}}},
@@ -98,7 +106,7 @@ def _hoisted(function: str, schema: Mapping[str, Any], components: dict[str, Any
     """A schema whose definitions have become components, under names that begin with the function's."""
 
     def named(name: str) -> str:
-        return _NOT_IN_NAMES.sub("_", f"{function}.{name}")
+        return f"{_NOT_IN_NAMES.sub('_', function)}.{_NOT_IN_NAMES.sub('_', name)}"
 
     def moved(part: Any) -> Any:
         if isinstance(part, list):

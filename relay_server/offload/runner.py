@@ -53,8 +53,8 @@ MARK = "SWITCHBOARD_CALLS"
 """Environment variable of what functions start: the folder of the progress socket, and the number of the process."""
 
 GROWTH_BYTES = 256 * MIB
-"""A process that has grown by more, or has more threads, gives way to a new one before its next call: functions have kept
-them. What the first call of each function leaves does not count, as the function may need it for all calls."""
+"""A process that has grown by more, or has more threads, gives way to a new one before its next call: functions have
+kept them. What the first call of each function leaves does not count, as the function may need it for all calls."""
 
 _LEFT_CALL = "left-"
 """Files beside the progress socket have this and the number of a call that a process has left to a new one."""
@@ -219,9 +219,10 @@ def run_call(body: bytes) -> bytes:
     """Carry out a :class:`WorkerCall`; returns an :class:`Outcome`, both as MessagePack. It raises nothing."""
     global _usual_bytes, _usual_threads
     call = msgspec.msgpack.decode(body, type=WorkerCall)
-    if _data_bytes() > _usual_bytes + GROWTH_BYTES or threading.active_count() > _usual_threads:
+    before = _data_bytes()
+    if before > _usual_bytes + GROWTH_BYTES or threading.active_count() > _usual_threads:
         _leave(call.number)
-    began, before = time.monotonic(), _data_bytes()
+    began = time.monotonic()
     outcome = _run(call, _to_socket(call.number))
     _end_children()
     if (call.name, call.version) not in _called:
