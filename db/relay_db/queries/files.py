@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import ColumnElement, and_, delete, func, insert, or_, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import FileUsage, Robot, StoredFile
+from relay_db.models import FileUsage, Realm, Robot, StoredFile
 from relay_db.queries.records import FileRecord, FileUsageRecord, fetch_all, fetch_one
 from relay_protocol.errors import Invalid, NotFound, Refused
 
@@ -81,6 +81,8 @@ def add_file(s: Session, robot_id: int, new: NewFile, quotas: FileQuotas, now: f
             raise Invalid(f"the file of this name and SHA-256 has {found.size} bytes, not {new.size}")
         touch_file(s, found.id, now)
         return found
+    # Files of other robots count as well, so they are added one after another.
+    s.execute(select(Realm.id).order_by(Realm.id).limit(1).with_for_update())
     _check_quotas(s, realm_id, usage, charged_bytes(new.size), quotas)
     values = {"robot_id": robot_id, "state": INCOMING, "state_since": now, **new._asdict()}
     s.execute(insert(StoredFile).values(**values))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any
 
 import pytest
 from sqlalchemy import insert, inspect
@@ -72,3 +75,30 @@ def test_postgresql_orders_names_of_files_by_their_bytes(database: Database) -> 
                 each for each in inspect(connection).get_columns("stored_file") if each["name"] == "name"
             ]
             assert name["type"].collation == "C"
+
+
+def test_files_of_two_robots_that_are_added_at_once_do_not_pass_a_quota(database: Database) -> None:
+    """Neither sees the other's before it is committed, so the second waits."""
+    quotas = queries.FileQuotas(robot=100_000, realm=10_000, relay=10_000)
+    with database.begin() as s:
+        robots = [queries.add_robot(s, name).id for name in ("one", "two")]
+
+    def add(s: Any, robot: int) -> None:
+        new = queries.NewFile(name="a", sha256="0" * 64, size=6000, origin="bags", modified=1.0)
+        queries.add_file(s, robot, new, quotas, 1.0)
+
+    def second() -> None:
+        with database.begin() as s:
+            begun.set()
+            add(s, robots[1])
+
+    begun = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        with database.begin() as s:
+            add(s, robots[0])
+            waiting = pool.submit(second)
+            begun.wait(1)
+            wait({waiting}, 0.3)
+            assert not waiting.done()
+        with pytest.raises(queries.FileQuotaExceeded):
+            waiting.result(60)
