@@ -16,6 +16,7 @@ from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage, Refused, SwitchboardError, Unavailable
 from relay_protocol.frames import SampleFrame
 from relay_protocol.function_link import (
+    MAX_DEADLINE,
     CallFunction,
     CancelFunction,
     FetchResult,
@@ -190,7 +191,7 @@ class FunctionLinkHandler(LinkHandler):
             self._service.cancel(job)
         self._running[number] = job
         job.on_progress = self._progress_sender(number, job)
-        await job.wait()
+        await self._service.wait(job, MAX_DEADLINE)
         return reply_of(job)
 
     def _progress_sender(self, number: int, job: Job) -> Callable[[], None]:

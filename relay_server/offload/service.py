@@ -11,6 +11,7 @@ from statistics import median
 from typing import Any
 
 from twisted.internet.defer import Deferred
+from twisted.internet.task import deferLater
 from twisted.logger import Logger
 
 from relay_db.queries import FunctionJobRecord
@@ -60,6 +61,9 @@ PURGE_SECONDS = 60.0
 
 SAVE_SECONDS = 5.0
 """Time after which an end that could not be stored is stored again."""
+
+LOOK_SECONDS = 1.0
+"""Time after which the database is asked again about a job that another relay works on."""
 
 RECENT = 200
 """Ended calls without a stored result that are still listed."""
@@ -478,8 +482,19 @@ class FunctionService:
 
     async def wait(self, job: Job, seconds: float) -> None:
         """Wait for the end of a job, or for a time."""
-        if not job.over and seconds > 0:
+        if job.over or seconds <= 0:
+            return
+        if job.id in self._jobs or job.id in self._admitting:
             await job.wait().addTimeout(seconds, as_twisted(self._clock), _ignore_timeout)
+            return
+        # Another relay works on it.
+        until = self._clock.seconds() + seconds
+        while not job.over and (left := until - self._clock.seconds()) > 0:
+            await deferLater(as_twisted(self._clock), min(left, LOOK_SECONDS))
+            record = await self._store.get(job.id)
+            if record is None:
+                return
+            job.restore(record)
 
     def cancel(self, job: Job) -> None:
         """End a job that waits or runs."""

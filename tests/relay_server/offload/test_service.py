@@ -392,5 +392,10 @@ def test_a_job_that_another_relay_has_taken_over_is_not_begun(world: FunctionWor
     assert world.state(job.id) == "running"
     shown = result(Deferred.fromCoroutine(one.job(world.rover, job.id)))
     assert shown.state == "running"
+    waiting = Deferred.fromCoroutine(one.wait(shown, 30.0))
     begun.runs[0].outcome.callback(Outcome(value=b"\x01"))
     assert world.state(job.id) == "done"
+    assert not waiting.called
+    world.clock.advance(1.0)
+    result(waiting)
+    assert (shown.state, shown.outcome.value) == ("done", b"\x01")
