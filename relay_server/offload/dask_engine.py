@@ -43,6 +43,9 @@ LIST_SECONDS = 1.0
 COLLECT_SECONDS = 0.001
 """Dask's client collects messages for 10 ms; the release of a result would hold up the next call."""
 
+DESCRIBE_SECONDS = 3.0
+"""Time in which a new worker must describe itself. One that stands still must not hold up the others."""
+
 ANSWER_SECONDS = 10.0
 """A scheduler that does not answer for so long is lost."""
 
@@ -370,10 +373,19 @@ async def _list_workers(client: Client, known: Mapping[str, DaskWorker]) -> dict
     listed = {each["address"]: each for each in await client.run_on_scheduler(list_on_scheduler)}
     found = {address: worker for address, worker in known.items() if address in listed}
     new = [each for each in listed if each not in found or found[each].name != listed[each]["name"]]
-    if new:
-        answers = await client.run(describe_on_worker, workers=new, on_error="return")
-        found.update({address: _worker_of(listed[address], answers.get(address)) for address in new})
+    answers = await asyncio.gather(*(_described(client, each) for each in new))
+    described = {address: answer for address, answer in zip(new, answers, strict=True) if answer is not None}
+    found.update({address: _worker_of(listed[address], answer) for address, answer in described.items()})
     return found
+
+
+async def _described(client: Client, address: str) -> Any:
+    """A worker's description of itself; ``None``: it does not answer now, and is asked again."""
+    asking = client.run(describe_on_worker, workers=[address], on_error="return")
+    try:
+        return (await asyncio.wait_for(asking, DESCRIBE_SECONDS)).get(address)
+    except asyncio.TimeoutError:
+        return None
 
 
 def _worker_of(listed: dict[str, Any], answer: Any) -> DaskWorker:

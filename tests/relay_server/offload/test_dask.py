@@ -14,6 +14,7 @@ import pytest
 import pytest_twisted
 from twisted.internet import reactor
 from twisted.internet.defer import Deferred
+from twisted.internet.task import deferLater
 
 from relay_protocol.errors import Invalid, Unavailable
 from relay_protocol.functions import FunctionDescription, decode_value, encode_value
@@ -212,6 +213,28 @@ def test_a_scheduler_over_a_network_needs_certificates(
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:8786", "tcp://localhost:8786", "tcp://[::1]:8786"])
 def test_a_scheduler_on_this_machine_needs_none(address: str) -> None:
     assert security_of(address, ("", "", "")) is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_new_worker_that_stands_still_does_not_hold_up_the_others(cluster: Cluster) -> None:
+    """It does not say which functions it has. To an engine that connects all workers are new."""
+    await cluster.worker("plain")
+    still = await cluster.worker("gpu", "--label", "GPU=1")
+    still.process.freeze()
+    address, tls = cluster.scheduler.address, cluster.scheduler.tls
+    engine = DaskEngine(reactor, address, security_of(address, tls))
+    try:
+        await Deferred.fromCoroutine(engine.start(lambda: None))
+        await eventually("the other worker", engine.workers)
+        for _ in range(3):
+            assert [each.name.rpartition("-")[0] for each in engine.workers()] == ["plain"]
+            assert (await Deferred.fromCoroutine(engine.describe())).functions
+            await deferLater(reactor, 1.5)
+        still.process.signal(signal.SIGCONT)
+        await eventually("it answers", lambda: len(engine.workers()) == 2)
+    finally:
+        still.process.signal(signal.SIGCONT)
+        await Deferred.fromCoroutine(engine.stop())
 
 
 def test_a_call_goes_to_a_worker_whose_labels_are_free() -> None:
