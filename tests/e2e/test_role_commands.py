@@ -261,7 +261,17 @@ def test_by_the_command_line(world: World) -> None:
     cli = world.relay.cli
     assert 19 <= cli("role", "get", ROLE, "DEGREES", "--user", "bob")["value"] <= 21
     assert cli("role", "call", ROLE, "BEEP", "--user", "ann")["values"]["success"] is True
-    wait_for("the robot is free", lambda: world.relay.run_cli(*SET, "--user", "ann").returncode == 0)
+    said: list[str] = []
+
+    def is_set() -> bool:
+        done = world.relay.run_cli(*SET, "--user", "ann")
+        said.append(str(done.stderr))
+        return done.returncode == 0
+
+    try:
+        wait_for("the robot is free", is_set)
+    except AssertionError as error:
+        raise AssertionError(f"{error}: {said[-1]}") from None
     denied = world.relay.run_cli(*SET, "--user", "bob")
     assert (denied.returncode != 0, "publish" in denied.stderr) == (True, True), denied.stderr
     unseen = world.relay.run_cli("role", "get", ROLE, "DEGREES", "--user", "cid")
