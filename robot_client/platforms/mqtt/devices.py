@@ -260,9 +260,9 @@ class DeviceRegistry:
         calls: dict[str, DeviceCall] = {}
         for part in ordered:
             for element in part.elements:
-                elements[_free(used, f"/{name}/{element.name}")] = element
+                elements[_free(used, name, element.name)] = element
             for call in part.calls:
-                calls[_free(used, f"/{name}/{call.name}")] = call
+                calls[_free(used, name, call.name)] = call
         before = self.devices.get(name)
         others = self._items - (len(before.elements) + len(before.calls) if before else 0)
         if len(elements) + len(calls) > MAX_DEVICE_ITEMS:
@@ -283,11 +283,15 @@ def _hashable(availability: Iterable[PartAvailability]) -> list[PartAvailability
     return [PartAvailability(tuple(each.sources), each.mode) for each in availability]
 
 
-def _free(used: set[str], name: str) -> str:
-    """A name that is not used yet, and is used now."""
-    free, number = name, 2
+def _free(used: set[str], device: str, name: str) -> str:
+    """A name that is not used yet, and is used now.
+
+    The entity gets a number, and not its part: what moves the robot is known by the end of the name.
+    """
+    entity, slash, part = name.partition("/")
+    free, number = f"/{device}/{name}", 2
     while free in used:
-        free = f"{name}_{number}"
+        free = f"/{device}/{entity}_{number}{slash}{part}"
         number += 1
     used.add(free)
     return free

@@ -272,7 +272,11 @@ class EntityBuilder:
     :param name: of the entity, below its device
     :param problem: receives sentences about what is not understood
     :param parse: parses a template
+    :ivar moves: whether its commands move something. A broker would give a retained one to the device when that comes
+        back, maybe after a stop, so none is retained
     """
+
+    moves = False
 
     def __init__(
         self,
@@ -422,7 +426,7 @@ class EntityBuilder:
         return qos if qos in (0, 1, 2) and not isinstance(qos, bool) else 0
 
     def _retain(self) -> bool:
-        return self._config.get("retain") in (True, "true", "True")
+        return not self.moves and self._config.get("retain") in (True, "true", "True")
 
 
 # --- components ----------------------------------------------------------------------------------------------------
@@ -621,6 +625,7 @@ def _scene(entity: EntityBuilder) -> None:
 
 
 def _cover(entity: EntityBuilder) -> None:
+    entity.moves = True
     entity.element("", TEXT, _STATE)
     entity.element(
         "position",

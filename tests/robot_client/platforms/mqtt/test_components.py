@@ -10,6 +10,7 @@ import pytest
 
 from relay_protocol.errors import Invalid
 from robot_client.platforms.mqtt import templates
+from robot_client.platforms.mqtt.devices import DeviceNames, DeviceRegistry, ProblemList
 from robot_client.platforms.mqtt.home_assistant import ConfigTopic, parse_config, parse_topic
 from robot_client.platforms.mqtt.messages import BOOL, NUMBER, SET_BOOL, TEXT, TRIGGER
 from robot_client.platforms.mqtt.model import DevicePart, Element
@@ -189,6 +190,41 @@ def test_services_of_a_component(
     calls = discover(component, config).calls
     assert {each.name: (each.type, each.payload(True)) for each in calls} == services
     assert {each.topic for each in calls} == {"c"}
+
+
+def test_commands_of_a_cover_are_never_retained() -> None:
+    """The broker would give them to a cover that comes back, maybe after a stop."""
+    part = discover("cover", {"cmd_t": "c", "set_pos_t": "p", "tilt_cmd_t": "t", "ret": True})
+    commands = [each.command for each in part.elements if each.command is not None]
+    assert len(commands) == 2
+    assert not any(each.retain for each in (*commands, *part.calls))
+    switch = discover("switch", {"cmd_t": "c", "ret": True})
+    assert any(each.command is not None and each.command.retain for each in switch.elements)
+
+
+def test_entities_of_one_name_are_numbered_and_still_move() -> None:
+    """Motion is known by the end of a name: of topics and services of both."""
+    registry = DeviceRegistry(DeviceNames(None), ProblemList())
+    for node in ("left", "right"):
+        topic = f"homeassistant/cover/{node}/blind/config"
+        config = {
+            "dev": {"ids": ["b1"], "name": "Blinds"},
+            "cmd_t": f"b/{node}/set",
+            "set_pos_t": f"b/{node}/position",
+            "tilt_cmd_t": f"b/{node}/tilt",
+        }
+        where = parse_topic(topic, "homeassistant")
+        assert where is not None
+        registry.set_part(topic, parse_config(where, json.dumps(config).encode()))
+    (device,) = (each for each in registry.flush().devices.values() if each is not None)
+    assert set(device.calls) == {
+        f"/blinds/{entity}/{order}_cover"
+        for entity in ("blind", "blind_2")
+        for order in ("open", "close", "stop")
+    }
+    assert {name for name, each in device.elements.items() if each.command is not None} == {
+        f"/blinds/{entity}/{part}" for entity in ("blind", "blind_2") for part in ("position", "tilt")
+    }
 
 
 def test_stop_of_a_cover_is_called_at_a_stop() -> None:
