@@ -19,8 +19,13 @@ def end_key(end: PipeEnd, robot_id: int, owner_id: int) -> EndKey:
     """
     if end.program:
         return 0, f"{owner_id}/{end.address}"
+    name = resolve(end.name)
+    action, of_action, _ = name.partition("/_action/")
+    if of_action:
+        # Feedback and status of an action, or what begins a goal.
+        return robot_id, f"action {action}"
     kind = "service" if end.service else "action" if end.action else "topic"
-    return robot_id, f"{kind} {resolve(end.name)}"
+    return robot_id, f"{kind} {name}"
 
 
 class PipeEdge(NamedTuple):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
 from sqlalchemy.orm import Session
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, DeferredLock
 from twisted.logger import Logger
 
 from relay_db import queries
@@ -129,6 +129,7 @@ class PipeService:
         self._opening: set[int] = set()
         self._changing: Counter[int] = Counter()
         """Pipes that are being started, stopped or removed here, by the number of such changes."""
+        self._locks: dict[int, DeferredLock] = {}
         self._changed = 0
         """How many pipes were started, stopped, removed or ended here."""
         self._changes = Buckets(CHANGES_PER_SECOND, CHANGES_BURST, MAX_USERS, clock.seconds)
@@ -214,7 +215,7 @@ class PipeService:
             )
         if record.id in self._running:
             return self._status(record)
-        with self._while_changing(record):
+        async with self._changing_alone(record):
             await self._database.write(self._enable, user, record)
             record = record._replace(enabled=True, reason="")
             self._unopened[record.id] = record
@@ -227,9 +228,11 @@ class PipeService:
         :raises NotFound: there is none of this name, or it is another user's
         """
         record = await self._find(user, name)
-        with self._while_changing(record):
-            self._close(record)
+        # At once, and again when a start that was under way has gone on.
+        self._close(record)
+        async with self._changing_alone(record):
             await self._database.write(self._disable, user, record)
+            self._close(record)
         return self._status(record._replace(enabled=False, reason=""))
 
     async def remove(self, user: PipeUser, name: str) -> None:
@@ -238,9 +241,21 @@ class PipeService:
         :raises NotFound: there is none of this name, or it is another user's
         """
         record = await self._find(user, name)
-        with self._while_changing(record):
-            self._close(record)
+        self._close(record)
+        async with self._changing_alone(record):
             await self._database.write(self._remove, user, record)
+            self._close(record)
+
+    @asynccontextmanager
+    async def _changing_alone(self, record: PipeRecord) -> AsyncIterator[None]:
+        """Changes of one pipe follow each other. Meanwhile it is not opened by what the database says."""
+        with self._while_changing(record):
+            lock = self._locks.setdefault(record.id, DeferredLock())
+            await lock.acquire()
+            try:
+                yield
+            finally:
+                lock.release()
 
     @contextmanager
     def _while_changing(self, record: PipeRecord) -> Iterator[None]:
@@ -252,6 +267,7 @@ class PipeService:
             self._changing[record.id] -= 1
             if not self._changing[record.id]:
                 del self._changing[record.id]
+                self._locks.pop(record.id, None)
             self._changed += 1
 
     async def relay_of(self, user: PipeUser, name: str) -> RelayInfo | None:

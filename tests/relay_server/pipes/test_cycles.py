@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from relay_server.pipes.cycles import PipeEdge, find_cycle
+from relay_server.pipes.cycles import PipeEdge, end_key, find_cycle
+from relay_server.pipes.schemas import PipeEnd
 
 
 def edge(text: str) -> PipeEdge:
@@ -37,3 +38,17 @@ def test_a_cycle_is_found_unless_a_rate_limit_breaks_it(
 def test_topics_of_different_robots_are_different() -> None:
     there, back = PipeEdge("x", (1, "/a"), (2, "/a"), False), PipeEdge("y", (3, "/a"), (1, "/a"), False)
     assert find_cycle(there, [back]) == []
+
+
+def test_the_feedback_of_an_action_is_a_part_of_it() -> None:
+    """A goal causes feedback, so a pipe from the feedback to what sends the goals feeds itself."""
+    feedback, other, dock = (
+        end_key(PipeEnd(robot="rover", **{kind: name}), 1, 2)
+        for kind, name in (
+            ("topic", "/dock/_action/feedback"),
+            ("topic", "/dock/action/feedback"),
+            ("action", "/dock"),
+        )
+    )
+    assert feedback == dock
+    assert other != dock

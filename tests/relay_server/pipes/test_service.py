@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import pytest_twisted
 from sqlalchemy.orm import Session
+from twisted.internet.defer import Deferred
 
 from relay_db import queries
 from relay_protocol import link
@@ -429,3 +430,38 @@ async def test_a_pipe_runs_at_the_home_of_its_target(scene: PipeScene) -> None:
     await until([])
     for each in (first, second):
         each.leave("the test ends")
+
+
+@pytest.mark.parametrize("order", ["stop_pipe", "remove"])
+@pytest_twisted.ensureDeferred
+async def test_an_order_during_a_start_wins(
+    scene: PipeScene, monkeypatch: pytest.MonkeyPatch, order: str
+) -> None:
+    """It came later. Else a pipe would run that nothing stops."""
+    ann = await scene.begin()
+    await scene.service.add(ann, copy(name="copy", start=False))
+    write, begun, go_on = scene.service._database.write, Deferred[None](), Deferred[None]()
+
+    async def held(work: Any, *args: Any) -> Any:
+        done = await write(work, *args)
+        if work == scene.service._enable:
+            begun.callback(None)
+            await go_on
+        return done
+
+    monkeypatch.setattr(scene.service._database, "write", held)
+    starting = Deferred.fromCoroutine(scene.service.start_pipe(ann, "copy"))
+    await begun
+    ordering = Deferred.fromCoroutine(getattr(scene.service, order)(ann, "copy"))
+    await settled(scene)
+    assert not ordering.called
+    go_on.callback(None)
+    starting.addErrback(lambda failure: failure.trap(NotFound))
+    await starting
+    await ordering
+    await settled(scene)
+    assert not scene.service._running
+    assert not scene.service._unopened
+    assert not scene.service._locks
+    listed = [(each.name, each.state) for each in (await scene.service.pipes(ann)).pipes]
+    assert listed == ([("copy", "stopped")] if order == "stop_pipe" else [])
