@@ -73,7 +73,9 @@ class MemoryBroker:
     def unsubscribe(self, topics: Iterable[str]) -> None:
         self.subscribed.difference_update(topics)
 
-    def publish(self, topic: str, payload: str, qos: int = 0, retain: bool = False) -> None:
+    def publish(
+        self, topic: str, payload: str, qos: int = 0, retain: bool = False, *, stops: bool = False
+    ) -> None:
         if not self.connected:
             raise Unavailable("the gateway is not connected to the MQTT broker")
         self.published.append((topic, payload, qos, retain))

@@ -84,9 +84,12 @@ class BrokerPort(Protocol):
     def unsubscribe(self, topics: Iterable[str]) -> None:
         """End subscriptions."""
 
-    def publish(self, topic: str, payload: str, qos: int = 0, retain: bool = False) -> None:
+    def publish(
+        self, topic: str, payload: str, qos: int = 0, retain: bool = False, *, stops: bool = False
+    ) -> None:
         """Publish a message.
 
+        :param stops: whether it stops something; then it is sent however much waits
         :raises Unavailable: there is no connection, or too much waits for it
         """
 
@@ -218,10 +221,12 @@ class PahoBroker:
             if self._attempt is not None and self._connected_at is not None:
                 self._attempt.client.unsubscribe(some)
 
-    def publish(self, topic: str, payload: str, qos: int = 0, retain: bool = False) -> None:
+    def publish(
+        self, topic: str, payload: str, qos: int = 0, retain: bool = False, *, stops: bool = False
+    ) -> None:
         if self._attempt is None or self._connected_at is None:
             raise Unavailable("the gateway is not connected to the MQTT broker")
-        self._attempt.publish(topic, payload, qos, retain)
+        self._attempt.publish(topic, payload, qos, retain, stops)
 
     # --- from the thread -----------------------------------------------------------------------------------
 
@@ -299,10 +304,10 @@ class _Attempt:
         self._ended = True
         self.client.disconnect()
 
-    def publish(self, topic: str, payload: str, qos: int, retain: bool) -> None:
+    def publish(self, topic: str, payload: str, qos: int, retain: bool, stops: bool) -> None:
         """See :meth:`BrokerPort.publish`."""
         with self._unsent_lock:
-            if self._unsent >= MAX_UNSENT:
+            if self._unsent >= MAX_UNSENT and not stops:
                 raise Unavailable(f"{MAX_UNSENT} commands wait for the MQTT broker; try again later")
             self._unsent += 1
         properties = None

@@ -18,7 +18,7 @@ from twisted.internet.defer import Deferred, fail, succeed
 from twisted.logger import Logger
 
 from relay_protocol import link
-from relay_protocol.errors import Invalid, NotFound, SwitchboardError
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.limits import NAME
 from robot_client.alerts import MODULE, AlertCondition, OnAlert, ignore_alert
 from robot_client.motion.typed_topic import TypedTopic
@@ -613,12 +613,22 @@ class MqttPlatform(Platform):
         return "sent to the broker"
 
     def _send(self, call: DeviceCall, value: Any) -> None:
-        self._broker.publish(call.topic, call.payload(value), call.qos, call.retain)
+        self._broker.publish(call.topic, call.payload(value), call.qos, call.retain, stops=call.stops)
 
     def _stop_devices(self) -> str:
+        """Send each cover a stop, whatever becomes of the others.
+
+        :raises Unavailable: some got none
+        """
         stops = [call for live in self._live.values() for call in live.device.calls.values() if call.stops]
+        failed = []
         for call in stops:
-            self._send(call, None)
+            try:
+                self._send(call, None)
+            except SwitchboardError as error:
+                failed.append(str(error))
+        if failed:
+            raise Unavailable(f"{len(failed)} of {len(stops)} covers were sent no stop: {failed[0]}")
         return f"{len(stops)} covers were sent a stop"
 
     def prepare_call(self, service: str, type: str) -> None:

@@ -156,6 +156,8 @@ def test_too_many_commands_are_refused(mosquitto: Mosquitto, monkeypatch: pytest
     with pytest.raises(Unavailable, match="wait for the MQTT broker"):
         for _ in range(4):
             client.broker.publish("a", "b", 1)
+    # What stops something is sent all the same.
+    client.broker.publish("a", "STOP", 1, stops=True)
     mosquitto.thaw()
     client.broker.stop()
 

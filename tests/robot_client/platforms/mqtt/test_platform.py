@@ -316,6 +316,26 @@ def test_stop_stops_all_covers(world: GatewayWorld) -> None:
     assert world.broker.published == [("blind/set", "STOP", 0, False)]
 
 
+def test_a_stop_reaches_the_covers_behind_one_that_can_not_be_sent(
+    world: GatewayWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b", "c"):
+        device = {"ids": [name], "name": name}
+        world.discover("cover", {**COVER, "device": device, "command_topic": f"{name}/set"}, name)
+    publish, sent = world.broker.publish, list[str]()
+
+    def failing(topic: str, *args: Any, **more: Any) -> None:
+        if topic == "b/set":
+            raise Unavailable("the MQTT broker takes no messages now")
+        publish(topic, *args, **more)
+        sent.append(topic)
+
+    monkeypatch.setattr(world.broker, "publish", failing)
+    with pytest.raises(Unavailable, match="1 of 3 covers were sent no stop"):
+        world.call(STOP_DEVICES, TRIGGER)
+    assert sent == ["a/set", "c/set"]
+
+
 def test_state_that_can_not_be_read_is_a_problem_until_one_can(world: GatewayWorld) -> None:
     world.discover("light", LAMP)
     for bad in (b"maybe", b"\xff\xff", b"x" * 70_000):
