@@ -93,7 +93,7 @@ class Measurement:
         found = await self._process.ask(
             "roles_of", realm="lab", names=names, text=f"fierro:AXIS_{number}_{field}"
         )
-        assert found == [f"fierro:R{number}"], found
+        assert found == [f"R{number}"], found
         return time.perf_counter() - begun
 
     async def _query(self) -> float:

@@ -28,7 +28,7 @@ from relay_server.cli.app import (
 )
 from relay_server.cli.output import format_time, print_json, print_line, print_list, print_note, print_result
 from relay_server.roles.documents import load, write
-from relay_server.roles.service import check_not_started, store
+from relay_server.roles.service import check_not_started, iri_of, store
 from relay_server.roles.sparql import RESULTS_CSV, RESULTS_JSON, TURTLE, RoleGraphs
 
 _ENDINGS = {
@@ -65,8 +65,7 @@ def list_roles(app: App, element: str | None, realm: str | None, as_json: bool) 
         where = existing_realm(session, realm or DEFAULT_REALM)
         found = queries.list_roles(session, where)
         if element is not None:
-            iri = element if ":" in element else f"fierro:{element}"
-            names = {each.removeprefix("fierro:") for each in _graphs(session, where).roles_of(iri, None)}
+            names = _graphs(session, where).roles_of(iri_of(element), None) or []
             found = [each for each in found if each.name in names]
     cells = (
         (

@@ -30,7 +30,7 @@ class ElementForwarding(Protocol):
         """Have the robot's home carry out a command.
 
         :param address: network address of the client
-        :param path: below ``/api/v1/roles/``, escaped
+        :param path: below ``/api/v1/``, escaped
         :param body: JSON, or empty
         :returns: the body of the answer; ``None``: the robot is at no other relay
         :raises SwitchboardError: the home refuses, or can't be reached
@@ -69,8 +69,8 @@ class ClusterElements:
         if relay is None:
             return None
         client = ForwardedClient.of(principal, address)
-        status, answer = await self._forwarder.ask(method, f"/api/v1/roles/{path}", body, relay, client)
-        if status == 200:
+        status, answer = await self._forwarder.ask(method, f"/api/v1/{path}", body, relay, client)
+        if status in (200, 202):
             return answer
         raise _error_of(status, answer)
 
@@ -85,6 +85,14 @@ def _error_of(status: int, answer: bytes) -> SwitchboardError:
 
 
 def element_path(role: str, element: str, command: str = "") -> str:
-    """The path of an element below ``/api/v1/roles/``, or of a command on it."""
-    parts = [role, "elements", element, *([command] if command else [])]
+    """The path of an element below ``/api/v1/``, or of a command on it."""
+    return _path("roles", role, "elements", element, *([command] if command else []))
+
+
+def module_path(robot: str, module: str, command: str) -> str:
+    """The path of a command on a module below ``/api/v1/``."""
+    return _path("robots", robot, "modules", module, command)
+
+
+def _path(*parts: str) -> str:
     return "/".join(quote(each, safe="") for each in parts)

@@ -16,7 +16,7 @@ from relay_protocol.errors import Invalid, MalformedMessage, NotFound, Switchboa
 from relay_protocol.nonfinite import NUMBERS, marks_to_null
 from relay_server.access import Principal
 from relay_server.audit_log import AuditLog, AuditLogEntry
-from relay_server.cluster.element_commands import ElementForwarding, element_path
+from relay_server.cluster.element_commands import ElementForwarding, element_path, module_path
 from relay_server.cluster.relays import RelayInfo
 from relay_server.common.errors import NotDone
 from relay_server.icpi.programs import ProgramRegistry, function_of, port_of
@@ -183,11 +183,15 @@ class RoleCommands:
     ) -> str:
         """As :meth:`switch_resource`, also for a robot that is at another relay.
 
-        :param element: of the Role, which is bound to the resource
+        :param element: of the Role, which is bound to the resource; a module needs none
         """
-        answer = await self._forwarded(user, binding, "POST", element_path(role, element, command))
+        if binding.kind == "modules":
+            path = module_path(binding.robot, binding.name, command)
+        else:
+            path = element_path(role, element, command)
+        answer = await self._forwarded(user, binding, "POST", path)
         if answer is not None:
-            return _decoded(answer, ElementDone).state
+            return "" if binding.kind == "modules" else _decoded(answer, ElementDone).state
         return await self.switch_resource(user, binding, command)
 
     async def switch_resource(self, user: RoleUser, binding: Binding, command: Switch) -> str:

@@ -20,6 +20,7 @@ from relay_protocol.errors import Invalid, MalformedMessage
 from relay_server.roles.bindings import RESOURCE_EXAMPLE, binding_of
 from relay_server.roles.vocabulary import (
     FIERRO,
+    ID,
     MAX_BODY,
     MAX_DEPTH,
     MAX_IRI,
@@ -27,12 +28,15 @@ from relay_server.roles.vocabulary import (
     MAX_NAME,
     MAX_PROBLEMS,
     MAX_STATEMENTS,
+    PAPER,
     PARTS_OF_ROLE,
     PREFIXES,
     PROPERTIES,
     RDF_TYPE,
     SWITCHBOARD,
     TYPES,
+    canonical,
+    canonical_word,
 )
 
 FORMATS = {
@@ -70,9 +74,9 @@ class InvalidRole(Invalid):
 class LoadedRole(NamedTuple):
     """A Role that was read and checked.
 
-    :param document: in N-Triples, sorted
+    :param document: in N-Triples, sorted, in the words that were read
     :param robots: names of the robots that it refers to
-    :param notes: sentences about statements that are unusual, but allowed
+    :param notes: sentences about what the Role lacks to be started, and about unusual statements
     """
 
     name: str
@@ -92,9 +96,12 @@ def load(body: bytes, media: str) -> list[LoadedRole]:
     :raises InvalidRole: it lacks what a Role needs
     :raises Invalid: it is not valid, too large, or parsing could be dangerous
     """
-    statements = read(body, media)
+    spellings: dict[Triple, list[Triple]] = defaultdict(list)
+    for each in read(body, media):
+        spellings[canonical_statement(each)].append(each)
+    statements = list(spellings)
     check(statements)
-    return [_loaded(name, part) for name, part in split(statements).items()]
+    return [_loaded(name, part, spellings) for name, part in split(statements).items()]
 
 
 def read(body: bytes, media: str) -> Statements:
@@ -178,6 +185,25 @@ def _checked(triple: Triple) -> Triple:
     return triple
 
 
+def canonical_statement(statement: Triple) -> Triple:
+    """A statement with the words and names of the paper's namespace in ``fierro:``."""
+    if not any(isinstance(each, NamedNode) and each.value.startswith(PAPER) for each in statement):
+        return statement
+    subject, predicate, value = statement
+    is_type = predicate.value == RDF_TYPE
+    return Triple(
+        _canonical_term(subject),
+        NamedNode(canonical_word(predicate.value)),
+        NamedNode(canonical_word(value.value))
+        if is_type and isinstance(value, NamedNode)
+        else _canonical_term(value),
+    )
+
+
+def _canonical_term(term: Any) -> Any:
+    return NamedNode(canonical(term.value)) if isinstance(term, NamedNode) else term
+
+
 # --- checks -----------------------------------------------------------------------------------------------
 
 
@@ -191,7 +217,10 @@ def check(statements: Statements) -> None:
 def _word_problems(statements: Statements) -> Iterator[str]:
     for each in statements:
         word = _word(each.predicate)
-        if word is not None and (word not in TYPES or word == "role"):
+        if word == ID:
+            if not isinstance(each.object, Literal):
+                yield f"{sentence(each)}: the value is a resource; it must be a text"
+        elif word is not None and (word not in TYPES or word == "role"):
             yield f"{sentence(each)}: there is no property fierro:{word}{_similar(word)}"
         elif word is not None and isinstance(each.object, Literal):
             yield f"{sentence(each)}: the value is a text; it must be a resource"
@@ -223,8 +252,8 @@ def _role_problems(statements: Statements) -> Iterator[str]:
         for part in PARTS_OF_ROLE:
             found = values[role, part]
             if not found:
-                yield f"{short(role)} is a Role without fierro:{part}; add '{short(role)} fierro:{part} …'"
-            elif len(found) > 1:
+                continue
+            if len(found) > 1:
                 yield f"{sentence(found[1])}: this Role has a fierro:{part} already, {short(found[0].object)}"
             elif not types[found[0].object] <= {part, "object"}:
                 other = sorted(types[found[0].object] - {part, "object"})[0]
@@ -245,8 +274,18 @@ def _notes(statements: Statements) -> Iterator[str]:
     types = {each.subject: _word(each.object) for each in statements if each.predicate.value == RDF_TYPE}
     for each in statements:
         word, kind = _word(each.predicate), types.get(each.subject)
-        if word is not None and kind is not None and word not in PROPERTIES.get(kind, ()):
+        if word not in (None, ID) and kind is not None and word not in PROPERTIES.get(kind, ()):
             yield f"{sentence(each)}: a resource of type fierro:{kind} usually has no fierro:{word}"
+
+
+def missing_parts(statements: Iterable[Triple]) -> Iterator[str]:
+    """Sentences about what Roles lack to be started."""
+    statements = list(statements)
+    known = {(each.subject, _word(each.predicate)) for each in statements}
+    for role in _roles(statements):
+        for part in PARTS_OF_ROLE:
+            if (role, part) not in known:
+                yield f"{short(role)} is a Role without fierro:{part}; add '{short(role)} fierro:{part} …'"
 
 
 def _similar(word: str) -> str:
@@ -306,8 +345,8 @@ def _roles(statements: Statements) -> list[Any]:
     ]
 
 
-def _loaded(name: str, statements: Statements) -> LoadedRole:
-    lines = sorted(f"{each} ." for each in statements)
+def _loaded(name: str, statements: Statements, spellings: dict[Triple, list[Triple]]) -> LoadedRole:
+    lines = sorted(f"{each} ." for statement in statements for each in spellings[statement])
     robots = {
         found.robot
         for each in statements
@@ -315,9 +354,8 @@ def _loaded(name: str, statements: Statements) -> LoadedRole:
         and (found := binding_of(_text(each.object))) is not None
         and found.robot
     }
-    return LoadedRole(
-        name, "\n".join(lines), len(lines), sorted(robots), list(_notes(statements))[:MAX_PROBLEMS]
-    )
+    notes = [*missing_parts(statements), *_notes(statements)]
+    return LoadedRole(name, "\n".join(lines), len(lines), sorted(robots), notes[:MAX_PROBLEMS])
 
 
 # --- writing ----------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ CHILDREN = 2
 GRACE_SECONDS = 10.0
 """A process that takes so much longer than the limit of its requests is killed and begun again."""
 
-_FORKED = ("load", "query")
+_FORKED = frozenset({"load", "query", "all_roles_of"})
 
 
 class RoleProcess:

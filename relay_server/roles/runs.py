@@ -131,15 +131,20 @@ class RoleRuns:
         principal.require_full_scope()
         self._roles.count_change(principal)
         elements = await self._roles.elements(principal, role)
+        missing = await self._roles.missing(principal, role)
+        if missing:
+            raise Invalid(f"the Role {role} can't be started: {'; '.join(missing)}")
         async with self._lock(principal.realm, role):
             return await self._start(user, role, elements)
 
     async def _start(self, user: RoleUser, role: str, elements: list[RoleElement]) -> RoleRunState:
         principal = user.principal
-        role_id, parts = await self._database.write(
+        role_id, parts, before = await self._database.write(
             self._begin, user, role, lambda number: plan_of(number, elements)
         )
         self._unwatch(role_id)
+        if before is not None:
+            parts += await self._stop_others(before, user, parts)
         for part in parts:
             if not part.error:
                 part.error = await self._carry_out(user, role, part, start=True)
@@ -150,6 +155,16 @@ class RoleRuns:
             await self._watch(run)
             self._publish("role.started", run, self._admissions(role_id))
         return await self.state(principal, role)
+
+    async def _stop_others(
+        self, before: RoleRunRecord, user: RoleUser, parts: list[RolePart]
+    ) -> list[RolePart]:
+        """Stop what a Role ran before and has no more, as its document was replaced; what could not be stopped."""
+        owner = RoleUser(Principal.of_user(before.user), user.address, user.earliest_sent)
+        old = _others(before, parts)
+        for part in old:
+            part.error = await self._carry_out(owner, before.role, part, start=False)
+        return [each for each in old if each.still_runs]
 
     async def stop(self, user: RoleUser, role: str) -> RoleRunState:
         """Stop a Role: its pipes first, its modules last. Parts that could not be stopped can be stopped again.
@@ -381,9 +396,10 @@ class RoleRuns:
 
     def _begin(
         self, s: Session, user: RoleUser, role: str, plan: Callable[[int], list[RolePart]]
-    ) -> tuple[int, list[RolePart]]:
-        principal = user.principal
+    ) -> tuple[int, list[RolePart], RoleRunRecord | None]:
+        principal, before = user.principal, None
         for run in queries.list_role_runs(s, principal.realm, role):
+            before = run
             if run.user.id != principal.user_id and not run.reason:
                 raise StartedByAnother(
                     f"{run.user.name} has started the Role {role}; it must be stopped first"
@@ -397,9 +413,11 @@ class RoleRuns:
                 f"the Role {role} has nothing to start: no element is bound to a module or pipe, and no mapping "
                 "connects topics or fields of services"
             )
-        queries.set_role_parts(s, role_id, _encoded(parts))
+        # What runs on from before is stored until it is stopped.
+        others = [] if before is None else _others(before, parts)
+        queries.set_role_parts(s, role_id, _encoded([*parts, *others]))
         self._audit(s, f"user:{principal.full}", "role.start", role, principal.realm, user.address)
-        return role_id, parts
+        return role_id, parts, before
 
     def _note_stop(self, s: Session, user: RoleUser, run: RoleRunRecord, left: list[RolePart]) -> None:
         if left:
@@ -436,6 +454,12 @@ class RoleRuns:
 
 def _ignore(*_: object) -> None:
     pass
+
+
+def _others(before: RoleRunRecord, parts: list[RolePart]) -> list[RolePart]:
+    """What a Role ran before and has no more, in the order of stopping."""
+    kept = {each.resource for each in parts}
+    return [each for each in reversed(_decoded(before)) if each.resource not in kept]
 
 
 def _state_of(parts: list[RolePartState]) -> RunState:

@@ -23,7 +23,7 @@ from relay_server.roles.bindings import Binding, binding_of
 from relay_server.roles.documents import FORMATS, LoadedRole
 from relay_server.roles.process import RoleProcess
 from relay_server.roles.schemas import RoleElement, RoleInfo, StoredRole
-from relay_server.roles.vocabulary import FIERRO
+from relay_server.roles.vocabulary import FIERRO, canonical
 
 ROLES_PER_REALM = 20_000
 ROLES_PER_USER = 5_000
@@ -190,6 +190,10 @@ class RoleService:
             for each in found
         ]
         return sorted(elements, key=lambda each: each.name)
+
+    async def missing(self, principal: Principal, name: str) -> list[str]:
+        """Sentences about what a Role that the user may see lacks to be started."""
+        return list(await self._process.ask("missing", realm=principal.realm, name=name))
 
     # --- changes ------------------------------------------------------------------------------------------
 
@@ -369,7 +373,10 @@ class RoleService:
     async def _resolve(self, principal: Principal, element: str) -> frozenset[str]:
         names, iri = await self._names(principal), iri_of(element)
         found = await self._process.ask("roles_of", realm=principal.realm, names=names, text=iri)
-        return frozenset(each.removeprefix(FIERRO) for each in found)
+        if found is None:
+            with self._turn(principal):
+                found = await self._process.ask("all_roles_of", realm=principal.realm, names=names, text=iri)
+        return frozenset(found)
 
     async def _names(self, principal: Principal) -> list[str] | None:
         """Names of the Roles that a user may see; ``None`` for all. The graph is up to date then."""
@@ -433,7 +440,7 @@ class RoleService:
 
 def iri_of(element: str) -> str:
     """The IRI of an element by its name in ``fierro:``; an IRI is one already."""
-    return element if ":" in element else f"{FIERRO}{element}"
+    return canonical(element) if ":" in element else f"{FIERRO}{element}"
 
 
 def check_not_started(s: Session, realm: str, name: str) -> None:

@@ -17,17 +17,20 @@ from pyoxigraph import (
     BlankNode,
     Literal,
     NamedNode,
+    Quad,
     QueryBoolean,
     QuerySolutions,
     RdfFormat,
     Store,
+    Triple,
     parse,
     serialize,
 )
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid
-from relay_server.roles.vocabulary import FIERRO, PREFIXES, RDF_TYPE, SWITCHBOARD, TYPES
+from relay_server.roles.documents import canonical_statement, local_name, missing_parts
+from relay_server.roles.vocabulary import FIERRO, PAPER, PREFIXES, RDF_TYPE, SWITCHBOARD, TYPES
 
 RESULTS_JSON = "application/sparql-results+json"
 RESULTS_XML = "application/sparql-results+xml"
@@ -50,10 +53,14 @@ MAX_RESULT = 4 * 1024 * 1024
 
 _XSD_STRING = "http://www.w3.org/2001/XMLSchema#string"
 
-_OWNERS = "|".join(f"^fierro:{each}" for each in sorted(TYPES - {"mapping", "role"}))
+MAX_LOOKED_AT = 2000
+"""Statements that are looked at to resolve an element in the shared process; more take a process of their own."""
+
+_OWNING = TYPES - {"mapping", "role"}
+_OWNERS = "|".join(f"^fierro:{each}" for each in sorted(_OWNING))
 _STEP = f"fierro:mapping|^fierro:mapping|{_OWNERS}"
-_REACHED = f"""PREFIX fierro: <fierro:>
-SELECT DISTINCT ?item WHERE {{ <%s> ({_STEP})+ ?item }} LIMIT {MAX_ROWS}"""
+_STEPS_BACK = frozenset(f"{FIERRO}{each}" for each in ("mapping", *_OWNING))
+_MAPPING, _ROLE, _TYPE = NamedNode(f"{FIERRO}mapping"), NamedNode(f"{FIERRO}role"), NamedNode(RDF_TYPE)
 _RESOLVE = f"""PREFIX fierro: <fierro:>
 SELECT DISTINCT ?role WHERE {{
   <%s> ({_STEP})+ ?role
@@ -82,27 +89,63 @@ class RoleGraphs:
         """
         graph = graph_of(name)
         self._store.remove_graph(graph)
-        self._store.extend(
-            quad
-            for quad in parse(document, format=RdfFormat.N_TRIPLES, rename_blank_nodes=True)
-            for quad in [type(quad)(quad.subject, quad.predicate, quad.object, graph)]
-        )
+        quads = parse(document, format=RdfFormat.N_TRIPLES, rename_blank_nodes=True)
+        change = canonical_statement if PAPER in document else _unchanged
+        statements = (change(each.triple) for each in quads)
+        self._store.extend(Quad(each.subject, each.predicate, each.object, graph) for each in statements)
 
     def drop(self, name: str) -> None:
         """Remove a Role."""
         self._store.remove_graph(graph_of(name))
 
-    def roles_of(self, element: str, names: Sequence[str] | None) -> list[str]:
-        """The Roles that an element belongs to, itself or by what is mapped to it, as IRIs.
+    def roles_of(
+        self, element: str, names: Sequence[str] | None, most: int | None = None
+    ) -> list[str] | None:
+        """Names of the Roles that an element belongs to, itself or by what is mapped to it.
 
         :param element: its IRI
         :param names: of the Roles that may be used; ``None`` for all
+        :param most: statements that may be looked at
+        :returns: ``None`` if there are more
         """
         element = _checked_iri(element)
-        if names is not None:
-            names = self._touched(element, set(names))
-        found: Any = self._store.query(_RESOLVE % element, **_dataset(names))
-        return [each["role"].value for each in found]
+        quads = self._connected(NamedNode(element), most)
+        if quads is None:
+            return None
+        # A path over statements in one graph is quick; over many graphs, Oxigraph looks into each at each step.
+        near, graphs = Store(), None if names is None else {graph_of(each) for each in names}
+        near.extend(
+            Quad(each.subject, each.predicate, each.object)
+            for each in quads
+            if graphs is None or each.graph_name in graphs
+        )
+        found: Any = near.query(_RESOLVE % element)
+        return [local_name(each["role"]) for each in found]
+
+    def _connected(self, element: NamedNode, most: int | None) -> list[Quad] | None:
+        """The statements that the path of :data:`_RESOLVE` can take in any Role."""
+        found: list[Quad] = []
+        seen, waiting = {element}, [element]
+        looked_at = 0
+        while waiting:
+            item = waiting.pop()
+            for each in chain(
+                self._store.quads_for_pattern(None, None, item),
+                self._store.quads_for_pattern(item, _MAPPING, None),
+                self._store.quads_for_pattern(item, _TYPE, _ROLE),
+            ):
+                looked_at += 1
+                if most is not None and looked_at > most:
+                    return None
+                ahead = each.subject == item
+                if not ahead and each.predicate.value not in _STEPS_BACK:
+                    continue
+                found.append(each)
+                reached: Any = each.object if ahead else each.subject
+                if each.predicate != _TYPE and reached not in seen and not isinstance(reached, Literal):
+                    seen.add(reached)
+                    waiting.append(reached)
+        return found
 
     def bindings(self, element: str, name: str) -> list[tuple[str, str]] | None:
         """Resources of an element, and of those that are mapped to it within a Role: pairs of element and resource.
@@ -130,7 +173,8 @@ class RoleGraphs:
             new = {"iri": term.value, "types": [], "resources": [], "mappings": []}
             return found.setdefault(term.value, new)
 
-        quads = self._store.quads_for_pattern(None, None, None, graph_of(name))
+        quads: list[Any] = list(self._store.quads_for_pattern(None, None, None, graph_of(name)))
+        roles = {each.subject.value for each in quads if each.object == _ROLE}
         for subject, predicate, value, _ in sorted(quads, key=str):
             if not isinstance(subject, NamedNode):
                 continue
@@ -139,30 +183,19 @@ class RoleGraphs:
             elif predicate.value == RDF_TYPE:
                 element(subject)["types"].append(value.value.removeprefix(FIERRO))
             elif isinstance(value, NamedNode) and predicate.value.startswith(FIERRO):
+                # A text, such as an ID, is no element.
                 kind = predicate.value.removeprefix(FIERRO)
                 if kind == "mapping":
                     element(subject)["mappings"].append(value.value)
                 elif kind not in element(value)["types"]:
                     # The property that leads to a resource has the name of its type.
                     element(value)["types"].append(kind)
-        return [each for iri, each in found.items() if iri != graph_of(name).value]
+        return [each for iri, each in found.items() if iri not in roles]
 
-    def _touched(self, element: str, names: set[str]) -> list[str]:
-        """Those of the Roles with a statement about the element, or about something that it leads to.
-
-        A path over few graphs is quick; over all that a user may see, Oxigraph looks into each graph at each step. A
-        step's statement has a subject that the path reaches, so no Role that matters is left out.
-        """
-        reached: Any = self._store.query(_REACHED % element, use_default_graph_as_union=True)
-        items = [NamedNode(element), *(each["item"] for each in reached)]
-        if len(items) > MAX_ROWS:
-            return sorted(names)
-        found = {
-            _role_of(quad.graph_name)
-            for each in items
-            for quad in self._store.quads_for_pattern(each, None, None, None)
-        }
-        return sorted(found & names)
+    def missing(self, name: str) -> list[str]:
+        """Sentences about what a Role lacks to be started."""
+        quads = self._store.quads_for_pattern(None, None, None, graph_of(name))
+        return list(missing_parts(each.triple for each in quads))
 
     def query(
         self, text: str, names: Sequence[str] | None, rows_media: str, graph_media: str
@@ -174,6 +207,7 @@ class RoleGraphs:
         :param graph_media: for CONSTRUCT and DESCRIBE
         :raises Invalid: it is not valid, or has too many results
         """
+        text = text.replace(f"<{PAPER}#", f"<{FIERRO}").replace(f"<{PAPER}>", f"<{FIERRO}>")
         try:
             result = self._store.query(text, prefixes=PREFIXES, **_dataset(names))
             if isinstance(result, QueryBoolean):
@@ -192,6 +226,10 @@ class RoleGraphs:
         )
 
 
+def _unchanged(statement: Triple) -> Triple:
+    return statement
+
+
 def graph_of(name: str) -> NamedNode:
     """The named graph of a Role."""
     return NamedNode(f"{FIERRO}{name}")
@@ -206,11 +244,6 @@ def _checked_iri(text: str) -> str:
     if any(each in text for each in '<>"{}|^`\\ \n'):
         raise Invalid(f"'{text[:60]}' is no IRI")
     return text
-
-
-def _role_of(graph: Any) -> str:
-    """The Role of a named graph."""
-    return str(graph.value).removeprefix(FIERRO)
 
 
 def _dataset(names: Sequence[str] | None) -> dict[str, Any]:

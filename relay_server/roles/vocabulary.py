@@ -5,6 +5,10 @@ from __future__ import annotations
 FIERRO = "fierro:"
 """The namespace of types and properties. A type and the property that leads to it have the same name."""
 
+PAPER = "http://www-robot.mes.titech.ac.jp/fierro"
+"""The namespace as the FIERRo paper's files declare it: without a hash, so ``fierro:port`` is ``…/fierroport``, while
+types are ``…/fierro#port``. Documents keep what was read; checks and queries see :data:`FIERRO`."""
+
 SWITCHBOARD = "switchboard:"
 """The namespace of properties that bind an element to a resource of a robot."""
 
@@ -43,6 +47,21 @@ PROPERTIES: dict[str, frozenset[str]] = {
 """The properties of each type."""
 
 TYPES = frozenset(PROPERTIES)
+
+ID = "ID"
+"""A property of any resource: a text that people call it by."""
+
+_PAPER_WORDS = {f"{PAPER}{each}": f"{FIERRO}{each}" for each in (*PROPERTIES, ID)}
+
+
+def canonical(iri: str) -> str:
+    """An IRI in the paper's namespace in ``fierro:``; another one unchanged."""
+    return FIERRO + iri.removeprefix(f"{PAPER}#") if iri.startswith(f"{PAPER}#") else iri
+
+
+def canonical_word(iri: str) -> str:
+    """As :func:`canonical`, for a type or property: the paper's form without a hash too."""
+    return _PAPER_WORDS.get(iri) or canonical(iri)
 
 MAX_BODY = 1024 * 1024
 """Bytes of a document that is loaded."""

@@ -22,7 +22,7 @@ import msgspec
 
 from relay_protocol.errors import Invalid
 from relay_server.roles.documents import InvalidRole, load
-from relay_server.roles.sparql import RoleGraphs
+from relay_server.roles.sparql import MAX_LOOKED_AT, RoleGraphs
 
 SECONDS = 5.0
 """A child is killed after this time."""
@@ -35,8 +35,9 @@ HEAD = struct.Struct(">I")
 
 class WorkerRequest(msgspec.Struct):
     """
-    :param do: ``load`` reads a document; ``put`` and ``drop`` change the graph; ``roles_of`` resolves;
-        ``bindings`` and ``elements`` read one Role; ``query`` asks
+    :param do: ``load`` reads a document; ``put`` and ``drop`` change the graph; ``roles_of`` resolves,
+        unless that takes long, and ``all_roles_of`` does so in a child;
+        ``bindings``, ``elements`` and ``missing`` read one Role; ``query`` asks
     :param names: Roles that may be used; ``None`` for all
     :param text: an IRI, a query, or a document in N-Triples
     :param media: of a document, or of the results of SELECT
@@ -108,7 +109,9 @@ class Worker:
 
     def _begin(self, request: WorkerRequest) -> None:
         graphs = self._graphs.setdefault(request.realm, RoleGraphs()) if request.realm else RoleGraphs()
-        if request.do == "load":
+        if request.do == "all_roles_of":
+            self._fork(request, lambda: graphs.roles_of(request.text, request.names))
+        elif request.do == "load":
             self._fork(request, lambda: [each._asdict() for each in load(request.body, request.media)])
         elif request.do == "query":
             self._fork(
@@ -123,8 +126,10 @@ class Worker:
             self._send(_carried_out(request.id, lambda: graphs.bindings(request.text, request.name)))
         elif request.do == "elements":
             self._send(_carried_out(request.id, lambda: graphs.elements(request.name)))
+        elif request.do == "missing":
+            self._send(_carried_out(request.id, lambda: graphs.missing(request.name)))
         else:
-            self._send(_carried_out(request.id, lambda: graphs.roles_of(request.text, request.names)))
+            self._send(_carried_out(request.id, lambda: graphs.roles_of(request.text, request.names, MAX_LOOKED_AT)))
 
     def _fork(self, request: WorkerRequest, work: Callable[[], Any]) -> None:
         reading, writing = os.pipe()

@@ -368,3 +368,19 @@ def test_it_ends_with_a_right_of_its_user(world: World) -> None:
     cli("right", "grant", "ann", "pad", "operator")
     cli("role", "stop", RUN, "--user", "ann")
     assert [each["action"] for each in cli("audit", "list")].count("role.end") == 1
+
+
+def test_what_a_replaced_role_has_no_more_is_stopped(world: World) -> None:
+    ann, headers = world.clients["ann"], {"Content-Type": "text/turtle", "If-Match": "*"}
+    assert [each["element"] for each in run(world, "ann", "start")["parts"]] == list(UP)
+    assert len(mapped_pipes(world)) == 1
+    less = RUN_DOCUMENT.replace(" ; fierro:mapping fierro:SPEED", "")
+    ann.put(f"/roles/{RUN}", content=less, headers=headers).raise_for_status()
+    assert [each["element"] for each in run(world, "ann", "start")["parts"]] == ["Driver", "Horn"]
+    assert mapped_pipes(world) == []
+    assert "SPEED" not in parts(world)
+    lacking = less.replace("fierro:subject fierro:Thermometer ;", "")
+    notes = ann.put(f"/roles/{RUN}", content=lacking, headers=headers).raise_for_status().json()["notes"]
+    refused = ann.post(f"/roles/{RUN}/run/start")
+    assert (refused.status_code, notes[0] in refused.json()["detail"]) == (400, True), refused.text
+    assert run(world, "ann", "stop")["state"] == "stopped"

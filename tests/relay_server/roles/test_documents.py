@@ -10,6 +10,9 @@ from rdflib.compare import isomorphic
 
 from relay_protocol.errors import Invalid
 from relay_server.roles.documents import FORMATS, InvalidRole, load, write
+from relay_server.roles.sparql import RESULTS_CSV, RoleGraphs
+from relay_server.roles.sparql import TURTLE as TURTLE_RESULT
+from relay_server.roles.vocabulary import PROPERTIES
 
 LISTING = Path("docs/examples/roles/gamepad.rdf").read_bytes()
 XML, TURTLE, JSON_LD = FORMATS
@@ -61,10 +64,6 @@ def test_a_document_of_several_roles_is_parted() -> None:
     ("text", "words"),
     [
         ("", "the document has no Role"),
-        (
-            "fierro:R a fierro:role .",
-            "fierro:R is a Role without fierro:subject; add 'fierro:R fierro:subject …'",
-        ),
         (WHOLE + "fierro:R fierro:action fierro:B .", "this Role has a fierro:action already"),
         (WHOLE + "fierro:S a fierro:port .", "the value has the type fierro:port, not fierro:subject"),
         (WHOLE + "fierro:S fierro:prot fierro:P .", "no property fierro:prot; is fierro:port meant?"),
@@ -79,6 +78,81 @@ def test_missing_role_field_is_named_with_the_statement(text: str, words: str) -
     with pytest.raises(InvalidRole) as error:
         load((HEAD + text).encode(), TURTLE)
     assert any(words in each for each in error.value.problems), error.value.problems
+
+
+def test_a_role_that_lacks_parts_is_loaded_and_says_so() -> None:
+    (role,) = load((HEAD + "fierro:R a fierro:role ; fierro:action fierro:A .").encode(), TURTLE)
+    lacks = [
+        f"fierro:R is a Role without fierro:{part}; add 'fierro:R fierro:{part} …'"
+        for part in ("subject", "directObject")
+    ]
+    assert role.notes == lacks
+    graphs = RoleGraphs()
+    graphs.put(role.name, role.document)
+    assert graphs.missing("R") == lacks
+
+
+PAPER = Path("tests/data/roles/lever-raises-gate.rdf").read_bytes()
+"""In the form of the paper: its namespace without a hash for properties, literal IDs, resources that are only named."""
+
+
+def test_a_file_in_the_form_of_the_paper_loads_and_comes_back_as_it_was() -> None:
+    (role,) = load(PAPER, XML)
+    assert (role.name, role.notes) == ("Lever-Raise-Gate", [])
+    for media in FORMATS:
+        body = write([role.document], media)
+        assert isomorphic(graph(body, media), graph(PAPER, XML))
+        assert load(body, media)[0].document == role.document
+
+
+def test_the_derivation_of_the_paper_is_a_query_on_its_file() -> None:
+    """From an element over its mapping to the port, the process, the action and the Role."""
+    (role,) = load(PAPER, XML)
+    graphs = RoleGraphs()
+    graphs.put(role.name, role.document)
+    assert graphs.roles_of("http://lab.example/LEVER_0", None) == ["Lever-Raise-Gate"]
+    assert graphs.missing(role.name) == []
+    names = {each["iri"] for each in graphs.elements(role.name)}
+    assert {"http://lab.example/LEVER_0", "fierro:Port_2"} <= names
+    assert not {each for each in names if "Lever-Raise-Gate" in each or "titech" in each}
+    _, rows = graphs.query(
+        """PREFIX fierro: <http://www-robot.mes.titech.ac.jp/fierro#>
+           SELECT ?port ?process ?action ?role {
+             <http://lab.example/LEVER_0> fierro:mapping ?port . ?process fierro:port ?port .
+             ?action fierro:process ?process . ?role fierro:action ?action ; a fierro:role }""",
+        None,
+        RESULTS_CSV,
+        TURTLE_RESULT,
+    )
+    assert rows.decode().splitlines()[1] == (
+        "fierro:Port_2,http://lab.example/leverdriver,http://lab.example/raise,"
+        "http://lab.example/Lever-Raise-Gate"
+    )
+
+
+@pytest.mark.parametrize("spelling", ["{}", "#{}"])
+@pytest.mark.parametrize("kind", PROPERTIES)
+def test_each_type_of_the_paper_loads_with_all_its_properties(kind: str, spelling: str) -> None:
+    space = "http://www-robot.mes.titech.ac.jp/fierro"
+    lines = [
+        f"<{space}{spelling.format(each)}> <http://lab.example/value{each}>"
+        for each in sorted(PROPERTIES[kind])
+    ]
+    item = f"<http://lab.example/item> a <{space}#{kind}> ; <{space}{spelling.format('ID')}> 'ITEM' ;"
+    text = f"{item} {' ; '.join(lines)} ."
+    if kind != "role":
+        text += f" <http://lab.example/R> a <{space}#role> ; <{space}subject> <http://lab.example/s> ."
+    (role,) = load(text.encode(), TURTLE)
+    assert all("without" in each for each in role.notes)
+    graphs = RoleGraphs()
+    graphs.put(role.name, role.document)
+    (found,) = [each for each in graphs.elements(role.name) if each["iri"].endswith("item")] or [None]
+    assert found is None if kind == "role" else found is not None and found["types"] == [kind]
+
+
+def test_an_id_is_a_text() -> None:
+    with pytest.raises(InvalidRole, match="it must be a text"):
+        load((HEAD + WHOLE + "fierro:S fierro:ID fierro:T .").encode(), TURTLE)
 
 
 def test_unusual_statements_are_noted() -> None:

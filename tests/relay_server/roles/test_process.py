@@ -35,7 +35,7 @@ def process() -> Iterator[RoleProcess]:
 
 @pytest_twisted.ensureDeferred
 async def test_an_element_leads_to_its_role(process: RoleProcess) -> None:
-    assert await process.ask("roles_of", text="fierro:AXIS_0", **HERE) == ["fierro:GamePad-Drive-Motors"]
+    assert await process.ask("roles_of", text="fierro:AXIS_0", **HERE) == ["GamePad-Drive-Motors"]
     assert await process.ask("roles_of", text="fierro:AXIS_9", **HERE) == []
     assert await process.ask("roles_of", text="fierro:AXIS_0", realm="lab", names=[]) == []
     with pytest.raises(Invalid):
@@ -114,9 +114,24 @@ async def test_an_element_leads_over_the_visible_roles_alone(process: RoleProces
             await process.ask("roles_of", realm="bridged", names=list(names), text="fierro:nAXIS_1")
         )
 
-    assert await roles("Near", "Whole") == ["fierro:Near"]
-    assert await roles("Near", "Whole", "Bridge") == ["fierro:GamePad-Drive-Motors", "fierro:Near"]
-    assert await roles("Whole", "Bridge") == ["fierro:GamePad-Drive-Motors"]
+    assert await roles("Near", "Whole") == ["Near"]
+    assert await roles("Near", "Whole", "Bridge") == ["GamePad-Drive-Motors", "Near"]
+    assert await roles("Whole", "Bridge") == ["GamePad-Drive-Motors"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_element_of_many_roles_is_resolved_in_a_process_of_its_own(process: RoleProcess) -> None:
+    kind, names = "<http://www.w3.org/1999/02/22-rdf-syntax-ns#type>", [f"M{each}" for each in range(1100)]
+    for name in names:
+        text = f"<fierro:{name}> {kind} <fierro:role> .\n<fierro:{name}> <fierro:action> <fierro:COMMON> ."
+        await process.ask("put", realm="many", name=name, text=text)
+    shared = {"realm": "many", "text": "fierro:COMMON"}
+    for seen in (None, names, names[:3]):
+        assert await process.ask("roles_of", names=seen, **shared) is None
+        found = await process.ask("all_roles_of", names=seen, **shared)
+        assert sorted(found) == sorted(names if seen is None else seen)
+    with pytest.raises(Invalid, match="took longer than"):
+        await process.ask("all_roles_of", names=None, seconds=0.0001, **shared)
 
 
 PRODUCT = " ".join(f"?a{each} ?b{each} ?c{each} ." for each in range(8))

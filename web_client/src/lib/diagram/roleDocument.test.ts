@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest'
-import { addressOf, bindingOf, boundTo, type Document, mappingOf, partsOf, withoutStatement, withStatement } from './roleDocument'
+import { addressOf, bindingOf, boundTo, type Document, mappingOf, nameOf, partsOf, withoutStatement, withStatement } from './roleDocument'
 
 const TYPE = 'http://www.w3.org/1999/02/22-rdf-syntax-ns#type'
 const ref = (name: string) => ({ '@id': `fierro:${name}` })
@@ -38,6 +38,24 @@ describe('a document of a Role', () => {
     expect(withStatement(GAMEPAD, mappingOf('fierro:AXIS_0', 'fierro:Port_5'))).toBe(GAMEPAD)
     const unbound = withoutStatement(GAMEPAD, bindingOf('fierro:AXIS_0', 'robots/pad/topics/joy#/axes/0'))
     expect(partsOf(unbound).items.find(({ name }) => name === 'AXIS_0')?.resources).toEqual([])
+  })
+
+  it('is the same in the namespace of the paper, with a hash and without', () => {
+    const paper = 'http://www-robot.mes.titech.ac.jp/fierro'
+    const text = JSON.stringify(GAMEPAD)
+      .replaceAll(/"fierro:(\w+)":/g, `"${paper}$1":`)
+      .replaceAll('fierro:', `${paper}#`)
+    const written = JSON.parse(text) as Document
+    const { parts, items } = partsOf(written)
+    expect(parts).toEqual(partsOf(GAMEPAD).parts)
+    const plain = (each: (typeof items)[number]) => [each.name, each.type, each.lane, each.resources, each.mappings.map(nameOf)]
+    expect(items.map(plain)).toEqual(partsOf(GAMEPAD).items.map(plain))
+    const mapping = mappingOf(`${paper}#AXIS_0`, `${paper}#Port_5`)
+    expect(withStatement(written, mapping)).toBe(written)
+    const less = withoutStatement(written, mapping)
+    expect(partsOf(less).items.find(({ name }) => name === 'AXIS_0')?.mappings).toEqual([`${paper}#Elsewhere`])
+    const again = withStatement(less, mapping)
+    expect(again.find((each) => `${paper}#mapping` in each)?.['@id']).toBe(`${paper}#AXIS_0`)
   })
 })
 

@@ -1,6 +1,8 @@
 /** Documents of Roles as JSON-LD, as the relay writes them: expanded, one object for each resource. */
 
 const FIERRO = 'fierro:'
+/** The namespace as the FIERRo paper's files have it: types and names follow a hash, properties may follow at once. */
+const PAPER = 'http://www-robot.mes.titech.ac.jp/fierro'
 const TYPE = 'http://www.w3.org/1999/02/22-rdf-syntax-ns#type'
 const RESOURCE = 'switchboard:resource'
 const MAPPING = 'fierro:mapping'
@@ -31,7 +33,17 @@ export interface RoleParts {
 }
 
 export function nameOf(iri: string): string {
-  return iri.startsWith(FIERRO) ? iri.slice(FIERRO.length) : iri
+  return afterStart(iri, FIERRO, `${PAPER}#`) ?? iri
+}
+
+/** The word of a type or property, in each of its spellings; null if it is of another vocabulary. */
+function wordOf(iri: string): string | null {
+  return afterStart(iri, FIERRO, `${PAPER}#`, PAPER)
+}
+
+function afterStart(iri: string, ...starts: string[]): string | null {
+  const start = starts.find((each) => iri.startsWith(each))
+  return start === undefined ? null : iri.slice(start.length)
 }
 
 /** The elements of a Role, in the order of its parts. */
@@ -44,14 +56,14 @@ export function partsOf(document: Document): RoleParts {
     }
   }
   for (const each of document) {
-    const own = idsOf(each[TYPE]).find((iri) => iri.startsWith(FIERRO))
-    if (own !== undefined) types.set(each['@id'], nameOf(own))
+    const own = typesOf(each)[0]
+    if (own !== undefined) types.set(each['@id'], own)
   }
-  const role = document.find((each) => idsOf(each[TYPE]).includes('fierro:role'))
+  const role = document.find((each) => typesOf(each).includes('role'))
   const parts = { subject: '', action: '', directObject: '' }
   const heads = new Map<string, Lane>()
   for (const lane of LANES) {
-    const head = idsOf(role?.[FIERRO + lane])[0]
+    const head = valuesOf(role, lane)[0]
     if (head === undefined) continue
     parts[lane] = nameOf(head)
     heads.set(head, lane)
@@ -71,7 +83,7 @@ export function partsOf(document: Document): RoleParts {
       }
     }
   }
-  const mapped = document.flatMap((each) => idsOf(each[MAPPING]))
+  const mapped = document.flatMap((each) => valuesOf(each, 'mapping'))
   const iris = new Set([...lanes.keys(), ...document.map((each) => each['@id']), ...mapped])
   const items = [...iris]
     .filter((iri) => !heads.has(iri) && iri !== role?.['@id'] && !iri.startsWith('_:'))
@@ -81,7 +93,7 @@ export function partsOf(document: Document): RoleParts {
       type: types.get(iri) ?? 'element',
       lane: lanes.get(iri) ?? null,
       resources: textsOf(resources.get(iri)?.[RESOURCE]),
-      mappings: idsOf(resources.get(iri)?.[MAPPING]),
+      mappings: valuesOf(resources.get(iri), 'mapping'),
     }))
   return { parts, items }
 }
@@ -90,9 +102,9 @@ export function partsOf(document: Document): RoleParts {
 export function withStatement(document: Document, statement: Statement): Document {
   const [subject, property, value] = statement
   const found = document.find((each) => each['@id'] === subject) ?? { '@id': subject }
-  const values = listOf(found[property])
-  if (values.some((each) => same(each, value))) return document
-  const changed = { ...found, [property]: [...values, value] }
+  if (spellings(found, property).some((each) => listOf(found[each]).some((other) => same(other, value)))) return document
+  const spelt = property === MAPPING && isPaper(document) ? `${PAPER}#mapping` : property
+  const changed = { ...found, [spelt]: [...listOf(found[spelt]), value] }
   return [...document.filter((each) => each['@id'] !== subject), changed]
 }
 
@@ -101,9 +113,11 @@ export function withoutStatement(document: Document, statement: Statement): Docu
   return document
     .map((each) => {
       if (each['@id'] !== subject) return each
-      const left = listOf(each[property]).filter((other) => !same(other, value))
-      const { [property]: _, ...rest } = each
-      return (left.length === 0 ? rest : { ...each, [property]: left }) as Resource
+      const concerned = spellings(each, property)
+      const left = Object.entries(each).map(([key, values]): [string, unknown] =>
+        concerned.includes(key) ? [key, listOf(values).filter((other) => !same(other, value))] : [key, values],
+      )
+      return Object.fromEntries(left.filter(([key, values]) => !concerned.includes(key) || listOf(values).length > 0)) as Resource
     })
     .filter((each) => Object.keys(each).length > 1)
 }
@@ -157,9 +171,29 @@ function decode(text: string | undefined): string {
 }
 
 function properties(resource: Resource): [string, string[]][] {
-  return Object.entries(resource)
-    .filter(([property]) => property.startsWith(FIERRO))
-    .map(([property, value]) => [nameOf(property), idsOf(value)])
+  return Object.entries(resource).flatMap(([property, value]) => {
+    const word = wordOf(property)
+    return word === null ? [] : [[word, idsOf(value)]]
+  })
+}
+
+/** The types of a resource that are words of Roles. */
+function typesOf(resource: Resource): string[] {
+  return idsOf(resource[TYPE]).flatMap((iri) => wordOf(iri) ?? [])
+}
+
+function valuesOf(resource: Resource | undefined, property: string): string[] {
+  return resource === undefined ? [] : properties(resource).flatMap(([word, iris]) => (word === property ? iris : []))
+}
+
+/** The keys of a resource that mean a property. */
+function spellings(resource: Resource, property: string): string[] {
+  const word = wordOf(property)
+  return Object.keys(resource).filter((key) => key === property || (word !== null && wordOf(key) === word))
+}
+
+function isPaper(document: Document): boolean {
+  return document.some((each) => Object.keys(each).some((key) => key.startsWith(PAPER)))
 }
 
 function listOf(value: unknown): unknown[] {
