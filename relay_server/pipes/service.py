@@ -175,11 +175,14 @@ class PipeService:
         """
         return self._status(await self._find(user, name))
 
-    async def add(self, user: PipeUser, new: NewPipe, owner: str = "", *, counted: bool = True) -> PipeStatus:
+    async def add(
+        self, user: PipeUser, new: NewPipe, owner: str = "", *, counted: bool = True, fresh: bool = True
+    ) -> PipeStatus:
         """Add a pipe, and start it if that is wanted.
 
         :param owner: full name of its owner, for the command line
         :param counted: whether it counts as a change of the user; a Role that is started counts itself
+        :param fresh: whether the owner asks for it now, so that it may begin to move a robot
         :raises NotFound: no such robot, or no right on it
         :raises Invalid: the settings can't be used, or the name is taken
         :raises Refused: it would feed itself; too many pipes
@@ -192,7 +195,7 @@ class PipeService:
             return self._status(record)
         try:
             return await self._start(
-                user, full_name(record.name, record.realm) if user.realm is None else new.name
+                user, full_name(record.name, record.realm) if user.realm is None else new.name, fresh
             )
         except PipeCycle:
             await self._database.write(self._remove, user, record)
@@ -207,7 +210,7 @@ class PipeService:
         self._count(user)
         return await self._start(user, name)
 
-    async def _start(self, user: PipeUser, name: str) -> PipeStatus:
+    async def _start(self, user: PipeUser, name: str, fresh: bool = True) -> PipeStatus:
         record = await self._find(user, name)
         if user.user_id is not None and user.user_id != record.owner_id:
             raise Refused(
@@ -219,7 +222,7 @@ class PipeService:
             await self._database.write(self._enable, user, record)
             record = record._replace(enabled=True, reason="")
             self._unopened[record.id] = record
-        await self._open(record, fresh=True)
+        await self._open(record, fresh=fresh)
         return self._status(await self._find(user, name))
 
     async def stop_pipe(self, user: PipeUser, name: str) -> PipeStatus:

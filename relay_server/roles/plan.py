@@ -1,12 +1,14 @@
 """The parts of a Role that start with it: modules, programs, devices, pipes, and pipes for mappings.
 
 A mapping joins topics and ports of programs, or fields of them with arguments and fields of the replies of services,
-and with fields of goals and of their results.
+and with fields of goals and of their results. An element without a resource in its Role has those of other Roles;
+then the pipe runs while these are started, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 import msgspec
 
@@ -28,6 +30,8 @@ class RolePart(msgspec.Struct):
     :param resource: as the document has it, or the pipe of a mapping
     :param mapped: whether the pipe was made for a mapping, so that it is removed with the Role's end
     :param new: of a mapping, the pipe as JSON
+    :param needs: of a mapping, other Roles that have one of its elements
+    :param waits: whether it is not started, as one of these is not
     :param error: why it was not started, or not stopped
     :param still_runs: whether it could not be stopped, but a second stop may succeed
     """
@@ -36,6 +40,8 @@ class RolePart(msgspec.Struct):
     resource: str
     mapped: bool = False
     new: str = ""
+    needs: list[str] = []
+    waits: bool = False
     error: str = ""
     still_runs: bool = False
 
@@ -55,9 +61,41 @@ class RolePart(msgspec.Struct):
         return [self.binding.robot] if self.binding.robot else []
 
 
-def plan_of(role_id: int, elements: Iterable[RoleElement]) -> list[RolePart]:
+class _End(NamedTuple):
+    """One end of a mapping.
+
+    :param role: another Role that has it; empty for the Role itself
+    """
+
+    binding: Binding
+    role: str = ""
+
+
+class _Mapped(NamedTuple):
+    """A pair of ends that a mapping joins.
+
+    :param element: names of both elements
+    """
+
+    element: str
+    source: _End
+    target: _End
+
+
+def unbound(elements: Iterable[RoleElement]) -> list[str]:
+    """Names of elements that mappings join, but that have no resource in their Role."""
+    elements = list(elements)
+    bound = {each.name for each in elements if each.resources}
+    joined = {name for each in elements if each.mappings for name in (each.name, *each.mappings)}
+    return sorted(joined - bound)
+
+
+def plan_of(
+    role_id: int, elements: Iterable[RoleElement], others: Mapping[str, Mapping[str, list[str]]] | None = None
+) -> list[RolePart]:
     """The parts of a Role, in the order of starting.
 
+    :param others: resources of elements in other Roles, by the element's and the Role's name
     :raises Invalid: there are too many
     """
     elements = list(elements)
@@ -70,7 +108,7 @@ def plan_of(role_id: int, elements: Iterable[RoleElement]) -> list[RolePart]:
     seen: dict[str, RolePart] = {}
     for each in parts:
         seen.setdefault(each.resource, each)
-    parts = [*seen.values(), *_mappings(role_id, elements)]
+    parts = [*seen.values(), *_mappings(role_id, elements, others or {})]
     if len(parts) > MAX_PARTS:
         raise Invalid(f"the Role has {len(parts)} parts to start; {MAX_PARTS} are allowed")
     return parts
@@ -90,27 +128,39 @@ def _devices(elements: Iterable[RoleElement]) -> Iterator[RolePart]:
                 yield RolePart(each.name, binding.text)
 
 
-def _mappings(role_id: int, elements: list[RoleElement]) -> Iterator[RolePart]:
+def _mappings(
+    role_id: int, elements: list[RoleElement], others: Mapping[str, Mapping[str, list[str]]]
+) -> Iterator[RolePart]:
     """A pipe for each pair of topics, ports or services with mappings from one to the other."""
-    by_name = {each.name: each for each in elements}
-    pairs: dict[tuple[tuple[str, str, str], ...], list[tuple[str, Binding, Binding]]] = {}
+    own = {each.name: each.resources for each in elements if each.resources}
+
+    def ends(name: str) -> list[_End]:
+        if name in own:
+            return [_End(each) for each in _carried(own[name])]
+        return [_End(each, role) for role, found in others.get(name, {}).items() for each in _carried(found)]
+
+    pairs: dict[tuple[tuple[str, str, str], ...], list[_Mapped]] = {}
     for each in elements:
         for name in each.mappings:
-            for source in _ends(each):
-                for target in _ends(by_name.get(name)):
-                    key = tuple((end.robot, end.kind, end.name) for end in (source, target))
+            for source in ends(each.name):
+                for target in ends(name):
+                    bindings = source.binding, target.binding
+                    key = tuple((end.robot, end.kind, end.name) for end in bindings)
                     if key[0] != key[1]:
-                        pairs.setdefault(key, []).append((f"{each.name} → {name}", source, target))
-    for number, mapped in enumerate(pairs.values(), 1):
-        yield _pipe_part(f"role-{role_id}-{number}", mapped)
+                        mapped = _Mapped(f"{each.name} → {name}", source, target)
+                        pairs.setdefault(key, []).append(mapped)
+    for number, pair in enumerate(pairs.values(), 1):
+        yield _pipe_part(f"role-{role_id}-{number}", pair)
 
 
-def _pipe_part(name: str, mapped: list[tuple[str, Binding, Binding]]) -> RolePart:
-    element = ", ".join(each for each, _, _ in mapped)
-    part = RolePart(element, f"pipes/{name}", mapped=True)
-    _, source, target = mapped[0]
-    whole = [not (a.pointer or b.pointer) for _, a, b in mapped]
-    paths = [[_path(end) for end in ends] for _, *ends in mapped]
+def _pipe_part(name: str, mapped: list[_Mapped]) -> RolePart:
+    element = ", ".join(each.element for each in mapped)
+    needs = {end.role for each in mapped for end in (each.source, each.target) if end.role}
+    part = RolePart(element, f"pipes/{name}", mapped=True, needs=sorted(needs))
+    bindings = [(each.source.binding, each.target.binding) for each in mapped]
+    source, target = bindings[0]
+    whole = [not (a.pointer or b.pointer) for a, b in bindings]
+    paths = [[_path(end) for end in pair] for pair in bindings]
     if not all(whole) and not all(map(all, paths)):
         part.error = "a field can't be mapped to a whole message; map a field to a field"
         return part
@@ -142,14 +192,13 @@ def _pipe_end(binding: Binding) -> PipeEnd:
     return PipeEnd(binding.robot, **{binding.kind.removesuffix("s"): name})
 
 
-def _ends(element: RoleElement | None) -> list[Binding]:
+def _carried(resources: Iterable[str]) -> list[Binding]:
     """A mapping can carry topics, ports and fields of services and actions. Only commands call these as a whole."""
-    if element is None:
-        return []
     return [
         each
-        for each in _bindings(element)
-        if each.kind in ("topics", "ports") or (each.kind in ("services", "actions") and each.pointer)
+        for each in map(binding_of, resources)
+        if each is not None
+        and (each.kind in ("topics", "ports") or (each.kind in ("services", "actions") and each.pointer))
     ]
 
 

@@ -27,8 +27,8 @@ from relay_server.pipes.schemas import NewPipe, PipeStatus
 from relay_server.pipes.service import PipeService, PipeUser, pipe_user
 from relay_server.roles.bindings import ElementNotCommandable, binding_of
 from relay_server.roles.commands import RoleCommands, RoleUser, Switch
-from relay_server.roles.plan import RolePart, plan_of
-from relay_server.roles.schemas import RoleElement, RoleInfo, RolePartState, RoleRunState, RunState
+from relay_server.roles.plan import RolePart, plan_of, unbound
+from relay_server.roles.schemas import RoleInfo, RolePartState, RoleRunState, RunState
 from relay_server.roles.service import RoleService
 from relay_server.sessions.manager import Admission, SessionManager
 
@@ -134,19 +134,22 @@ class RoleRuns:
         missing = await self._roles.missing(principal, role)
         if missing:
             raise Invalid(f"the Role {role} can't be started: {'; '.join(missing)}")
+        others = await self._roles.resources_elsewhere(principal, role, unbound(elements))
         async with self._lock(principal.realm, role):
-            return await self._start(user, role, elements)
+            started = await self._start(user, role, lambda number: plan_of(number, elements, others))
+        await self._join(principal.realm, role, principal.user_id)
+        return started
 
-    async def _start(self, user: RoleUser, role: str, elements: list[RoleElement]) -> RoleRunState:
+    async def _start(self, user: RoleUser, role: str, plan: Callable[[int], list[RolePart]]) -> RoleRunState:
         principal = user.principal
-        role_id, parts, before = await self._database.write(
-            self._begin, user, role, lambda number: plan_of(number, elements)
-        )
+        role_id, parts, before = await self._database.write(self._begin, user, role, plan)
         self._unwatch(role_id)
         if before is not None:
             parts += await self._stop_others(before, user, parts)
+        started = await self._started(principal.realm)
         for part in parts:
-            if not part.error:
+            part.waits = not started.issuperset(part.needs)
+            if not part.error and not part.waits:
                 part.error = await self._carry_out(user, role, part, start=True)
         await self._database.write(queries.set_role_parts, role_id, _encoded(parts))
         run = await self._find(principal.realm, role)
@@ -176,7 +179,9 @@ class RoleRuns:
         principal.require_full_scope()
         info = await self._roles.role(principal, role)
         async with self._lock(principal.realm, role):
-            return await self._stop(user, role, info)
+            stopped = await self._stop(user, role, info)
+        await self._join(principal.realm, role, principal.user_id)
+        return stopped
 
     async def _stop(self, user: RoleUser, role: str, info: RoleInfo) -> RoleRunState:
         principal = user.principal
@@ -195,6 +200,35 @@ class RoleRuns:
         if any(each.still_runs for each in parts):
             return await self.state(principal, role)
         return RoleRunState(role, "stopped", parts=_failed(parts))
+
+    async def _started(self, realm: str) -> frozenset[str]:
+        """Names of the Roles that are started."""
+        runs = await self._database.read(queries.list_role_runs, realm)
+        return frozenset(each.role for each in runs if not each.reason)
+
+    async def _join(self, realm: str, changed: str, by: int) -> None:
+        """Start or stop the pipes between other Roles and one that was started or stopped.
+
+        :param by: number of the user; a pipe of another user does not begin to move a robot by this
+        """
+        for run in await self._database.read(queries.list_role_runs, realm):
+            if any(changed in each.needs for each in _decoded(run)):
+                async with self._lock(realm, run.role):
+                    await self._join_one(realm, run.role, changed, by)
+
+    async def _join_one(self, realm: str, role: str, changed: str, by: int) -> None:
+        run = await self._find(realm, role)
+        if run is None or run.reason:
+            return
+        started, parts = await self._started(realm), _decoded(run)
+        owner = RoleUser(Principal.of_user(run.user), "")
+        for part in parts:
+            waits = not started.issuperset(part.needs)
+            if changed in part.needs and waits != part.waits:
+                part.waits = waits
+                fresh = run.user.id == by
+                part.error = await self._carry_out(owner, role, part, start=not waits, fresh=fresh)
+        await self._database.write(queries.set_role_parts, run.role_id, _encoded(parts))
 
     async def state(self, principal: Principal, role: str) -> RoleRunState:
         """The state of a Role now. Its parts are for the user who started it, and for those who may change the Role.
@@ -240,7 +274,9 @@ class RoleRuns:
 
     # --- parts --------------------------------------------------------------------------------------------
 
-    async def _carry_out(self, user: RoleUser, role: str, part: RolePart, *, start: bool) -> str:
+    async def _carry_out(
+        self, user: RoleUser, role: str, part: RolePart, *, start: bool, fresh: bool = True
+    ) -> str:
         """Start or stop a part; why that failed, or empty."""
         may_run = not start and (part.still_runs or not part.error)
         part.still_runs = False
@@ -253,7 +289,7 @@ class RoleRuns:
             await self._remove_pipe(pipes, name)
             if start:
                 new = msgspec.json.decode(part.new, type=NewPipe)
-                added = await self._pipes.add(pipes, new, counted=False)
+                added = await self._pipes.add(pipes, new, counted=False, fresh=fresh)
                 return added.why if added.state == "refused" else ""
         except SwitchboardError as error:
             part.still_runs = may_run and not isinstance(error, NotFound | ElementNotCommandable)
@@ -284,6 +320,8 @@ class RoleRuns:
         binding = part.binding
         if part.error:
             return "failed", part.error
+        if part.waits:
+            return "waiting", f"waiting for {' and '.join(part.needs)} to be started"
         if binding.kind == "pipes":
             pipe = pipes.get(binding.name)
             return ("failed", "the pipe was removed") if pipe is None else (pipe.state, pipe.why)
@@ -369,6 +407,7 @@ class RoleRuns:
                 await self._carry_out(owner, run.role, part, start=False)
         if await self._database.write(self._note_end, run, reason):
             self._publish("role.ended", run, admissions)
+            await self._join(run.realm, run.role, run.user.id)
 
     def _unwatch(self, role_id: int) -> list[Admission]:
         admissions = self._admissions(role_id)

@@ -191,6 +191,23 @@ class RoleService:
         ]
         return sorted(elements, key=lambda each: each.name)
 
+    async def resources_elsewhere(
+        self, principal: Principal, name: str, elements: list[str]
+    ) -> dict[str, dict[str, list[str]]]:
+        """Resources that elements have in other Roles that the user may see: by the element's and the Role's name.
+
+        :param name: of the Role itself
+        """
+        if not elements:
+            return {}
+        names, iris = await self._names(principal), {iri_of(each): each for each in elements}
+        answer = await self._process.ask("resources_of", realm=principal.realm, names=names, items=list(iris))
+        found: dict[str, dict[str, list[str]]] = {}
+        for iri, role, resource in answer:
+            if role != name:
+                found.setdefault(iris[iri], {}).setdefault(role, []).append(resource)
+        return found
+
     async def missing(self, principal: Principal, name: str) -> list[str]:
         """Sentences about what a Role that the user may see lacks to be started."""
         return list(await self._process.ask("missing", realm=principal.realm, name=name))

@@ -192,6 +192,27 @@ class RoleGraphs:
                     element(value)["types"].append(kind)
         return [each for iri, each in found.items() if iri not in roles]
 
+    def resources_of(
+        self, elements: Iterable[str], names: Sequence[str] | None
+    ) -> list[tuple[str, str, str]]:
+        """Resources of elements in all Roles: element, Role and resource.
+
+        :param elements: their IRIs
+        :param names: of the Roles that may be used; ``None`` for all
+        """
+        graphs = None if names is None else {graph_of(each) for each in names}
+        resource = NamedNode(f"{SWITCHBOARD}resource")
+        quads: Any = (
+            each
+            for element in elements
+            for each in self._store.quads_for_pattern(NamedNode(_checked_iri(element)), resource, None)
+        )
+        return [
+            (each.subject.value, local_name(each.graph_name), each.object.value)
+            for each in islice(quads, MAX_BINDINGS)
+            if graphs is None or each.graph_name in graphs
+        ]
+
     def missing(self, name: str) -> list[str]:
         """Sentences about what a Role lacks to be started."""
         quads = self._store.quads_for_pattern(None, None, None, graph_of(name))

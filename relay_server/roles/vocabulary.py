@@ -63,6 +63,7 @@ def canonical_word(iri: str) -> str:
     """As :func:`canonical`, for a type or property: the paper's form without a hash too."""
     return _PAPER_WORDS.get(iri) or canonical(iri)
 
+
 MAX_BODY = 1024 * 1024
 """Bytes of a document that is loaded."""
 

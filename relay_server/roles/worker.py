@@ -37,9 +37,10 @@ class WorkerRequest(msgspec.Struct):
     """
     :param do: ``load`` reads a document; ``put`` and ``drop`` change the graph; ``roles_of`` resolves,
         unless that takes long, and ``all_roles_of`` does so in a child;
-        ``bindings``, ``elements`` and ``missing`` read one Role; ``query`` asks
+        ``bindings``, ``elements`` and ``missing`` read one Role; ``resources_of`` reads all; ``query`` asks
     :param names: Roles that may be used; ``None`` for all
     :param text: an IRI, a query, or a document in N-Triples
+    :param items: IRIs
     :param media: of a document, or of the results of SELECT
     :param graph_media: of the results of CONSTRUCT
     """
@@ -50,6 +51,7 @@ class WorkerRequest(msgspec.Struct):
     name: str = ""
     names: list[str] | None = None
     text: str = ""
+    items: list[str] = []
     body: bytes = b""
     media: str = ""
     graph_media: str = ""
@@ -126,10 +128,14 @@ class Worker:
             self._send(_carried_out(request.id, lambda: graphs.bindings(request.text, request.name)))
         elif request.do == "elements":
             self._send(_carried_out(request.id, lambda: graphs.elements(request.name)))
+        elif request.do == "resources_of":
+            self._send(_carried_out(request.id, lambda: graphs.resources_of(request.items, request.names)))
         elif request.do == "missing":
             self._send(_carried_out(request.id, lambda: graphs.missing(request.name)))
         else:
-            self._send(_carried_out(request.id, lambda: graphs.roles_of(request.text, request.names, MAX_LOOKED_AT)))
+            self._send(
+                _carried_out(request.id, lambda: graphs.roles_of(request.text, request.names, MAX_LOOKED_AT))
+            )
 
     def _fork(self, request: WorkerRequest, work: Callable[[], Any]) -> None:
         reading, writing = os.pipe()

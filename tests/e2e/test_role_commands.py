@@ -384,3 +384,51 @@ def test_what_a_replaced_role_has_no_more_is_stopped(world: World) -> None:
     refused = ann.post(f"/roles/{RUN}/run/start")
     assert (refused.status_code, notes[0] in refused.json()["detail"]) == (400, True), refused.text
     assert run(world, "ann", "stop")["state"] == "stopped"
+
+
+OTHER = "Thermometer-Reports-Heat"
+OTHER_DOCUMENT = """
+@prefix fierro: <fierro:> .
+fierro:Thermometer-Reports-Heat a fierro:role ;
+  fierro:subject fierro:Probe ; fierro:action fierro:Report ; fierro:directObject fierro:Heat .
+fierro:Probe fierro:data fierro:HEAT . fierro:HEAT fierro:mapping fierro:TURN .
+"""
+"""Its mapping joins an element of the Role that moves the robot with one of a third Role."""
+TURN = "Wheels-Turn-Rover"
+TURN_DOCUMENT = """
+@prefix fierro: <fierro:> .
+@prefix switchboard: <switchboard:> .
+fierro:Wheels-Turn-Rover a fierro:role ;
+  fierro:subject fierro:Wheels ; fierro:action fierro:Turn ; fierro:directObject fierro:Rover .
+fierro:Turn fierro:process fierro:Beeper . fierro:Beeper switchboard:resource "robots/rover/services/beep" .
+fierro:Rover fierro:data fierro:TURN .
+fierro:TURN switchboard:resource "robots/pad/topics/cmd_vel#/angular/z" .
+"""
+
+
+def test_a_pipe_between_roles_runs_while_all_of_them_are_started(world: World) -> None:
+    ann = world.clients["ann"]
+    turtle = {"Content-Type": "text/turtle"}
+    for name, text in ((OTHER, OTHER_DOCUMENT), (TURN, TURN_DOCUMENT)):
+        ann.put(f"/roles/{name}", content=text, headers=turtle).raise_for_status()
+    whole = ann.put(f"/roles/{RUN}", content=RUN_DOCUMENT, headers={**turtle, "If-Match": "*"})
+    whole.raise_for_status()
+
+    def order(role: str, what: str) -> None:
+        ann.post(f"/roles/{role}/run/{what}").raise_for_status()
+
+    def part() -> dict[str, str]:
+        (found,) = ann.get(f"/roles/{OTHER}/run").json()["parts"]
+        return dict(found)
+
+    order(OTHER, "start")
+    assert part()["why"] == f"waiting for {RUN} and {TURN} to be started"
+    order(RUN, "start")
+    assert (part()["state"], len(mapped_pipes(world))) == ("waiting", 1)
+    order(TURN, "start")
+    assert part()["element"] == "HEAT → TURN"
+    wait_for("the pipe runs", lambda: part()["state"] == "running")
+    order(RUN, "stop")
+    assert (part()["state"], mapped_pipes(world)) == ("waiting", [])
+    for role in (OTHER, TURN):
+        order(role, "stop")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from relay_server.pipes.schemas import NewPipe
-from relay_server.roles.plan import plan_of
+from relay_server.roles.plan import plan_of, unbound
 from relay_server.roles.schemas import RoleElement
 
 
@@ -133,3 +133,18 @@ def test_mappings_that_are_impossible_say_why() -> None:
     assert "a field can't be mapped to a whole message" in errors["A → B"]
     assert errors["A → C"] == ""
     assert errors["D → E"].startswith("this can't be mapped: ")
+
+
+def test_a_mapping_to_an_element_of_another_role_needs_that_role() -> None:
+    elements = [
+        element("A", "robots/pad/topics/joy#/axes/0", mappings=("X", "Y", "Nowhere")),
+        element("Y", "robots/rover/topics/y#/data"),
+        element("Z", mappings=("Y",)),
+    ]
+    assert unbound(elements) == ["Nowhere", "X", "Z"]
+    others = {
+        "X": {"Drive": ["robots/rover/topics/x#/data", "robots/rover/modules/m"]},
+        "Z": {"Other": ["robots/pad/topics/z#/data"]},
+    }
+    found = [(each.element, each.needs) for each in plan_of(2, elements, others)]
+    assert found == [("A → X", ["Drive"]), ("A → Y", []), ("Z → Y", ["Other"])]
