@@ -7,7 +7,7 @@ const [url, name, lamp] = process.argv.slice(2);
 
 const escape = (text) => text.replace(/[%!(]/g, (found) => `%${found.charCodeAt(0).toString(16).toUpperCase()}`);
 
-function write(dest, id, fx, args, { ak = 0, br = 0 } = {}) {
+function write(dest, id, fx, args, { ak = 1, br = 0 } = {}) {
 	const values = args.map((each, number) => `(${number})${escape(each)}`).join("");
 	return `${dest}!sn!${name}!id!${id}!ak!${ak}!fx!${fx}!ar!${values}!br!${br}`;
 }
@@ -32,7 +32,6 @@ function request(dest, fx, args = [], how = {}) {
 
 relay.onmessage = ({ data }) => {
 	const { id, fx, args } = read(data);
-	if (fx === "ack") console.log(`request ${id} has arrived`);
 	if (fx !== "reply" || !waiting.has(id)) return;
 	const { resolve, reject } = waiting.get(id);
 	waiting.delete(id);
@@ -45,7 +44,7 @@ relay.onclose = ({ code, reason }) => console.log(`closed: ${code} ${reason}`);
 relay.onopen = async () => {
 	try {
 		await request("relay", "register", [name, "[]", "[]"]);
-		await request(lamp, "toggle", [], { ak: 1 });
+		await request(lamp, "toggle");
 		console.log(`the lamp is ${JSON.parse(await request(lamp, "get", ["power"])) ? "on" : "off"}`);
 		console.log(`${await request("", "toggled", [lamp], { br: 1 })} programs were notified`);
 		await request(lamp, "explode").catch((error) => console.log(error.message));

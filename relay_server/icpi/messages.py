@@ -1,12 +1,14 @@
 """ICPI messages: ``dest!sn!sender!id!n!ak!0|1!fx!Function!ar!(0)v0(1)v1!br!0|1``.
 
-Values are text without ``!``, ``(`` and ``%``; these are written as ``%21``, ``%28`` and ``%25``, as in URLs.
+Values are text without ``!``, ``(`` and ``%``; these are written as ``%21``, ``%28`` and ``%25``. Other escapes are
+read as in URLs (RFC 3986, section 2.1), as bytes of UTF-8.
 """
 
 from __future__ import annotations
 
 import re
 from typing import NamedTuple
+from urllib.parse import unquote
 
 from relay_protocol.errors import Invalid
 
@@ -20,10 +22,10 @@ FORM = "dest!sn!sender!id!n!ak!0|1!fx!Function!ar!(0)v0(1)v1!br!0|1"
 _FIELDS = ("sn", "id", "ak", "fx", "ar", "br")
 _NAME = re.compile(r"[\w.~:/ -]{1,128}\Z")
 _FUNCTION = re.compile(r"[A-Za-z_]\w{0,63}\Z")
-_NUMBER = re.compile(r"(?:0|[1-9][0-9]{0,9})\Z")
+_ID = re.compile(r"[^!\x00-\x1f\x7f]{0,64}\Z")
 _ARGUMENT = re.compile(r"\((0|[1-9][0-9]?)\)([^(]*)")
 _ESCAPED = {"%": "%25", "!": "%21", "(": "%28"}
-_ESCAPE = re.compile(r"%(..)?")
+_NO_ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2}).{0,2}")
 
 
 class IcpiMessage(NamedTuple):
@@ -31,8 +33,8 @@ class IcpiMessage(NamedTuple):
 
     :param dest: the receiver: a Role, a program, or ``relay``
     :param sender: the program that sends it
-    :param id: of a request, chosen by its sender; its acknowledgement and reply have the same
-    :param acknowledge: whether the sender wants an acknowledgement
+    :param id: of a request, any text that its sender chooses, or empty; its reply has the same
+    :param acknowledge: whether the sender wants a reply
     :param function: what is called
     :param args: in order
     :param broadcast: whether it goes to all programs of the sender's user
@@ -40,7 +42,7 @@ class IcpiMessage(NamedTuple):
 
     dest: str
     sender: str
-    id: int
+    id: str
     acknowledge: bool
     function: str
     args: tuple[str, ...] = ()
@@ -66,12 +68,12 @@ def parse(text: str) -> IcpiMessage:
     sender = _unescaped(sender)
     if sender and not _NAME.match(sender):
         raise Invalid(f"'{sender[:40]}' is no sender")
-    if not _NUMBER.match(id):
-        raise Invalid(f"'{id[:20]}' is no id: it must be a whole number of at most ten digits")
+    if not _ID.match(id):
+        raise Invalid(f"'{id[:20]}' is no id: it has 64 characters at most, and no control characters")
     if not _FUNCTION.match(function):
         raise Invalid(f"'{function[:40]}' is no function: it must have letters, digits and '_'")
     return IcpiMessage(
-        dest, sender, int(id), _flag("ak", acknowledge), function, _arguments(args), _flag("br", broadcast)
+        dest, sender, id, _flag("ak", acknowledge), function, _arguments(args), _flag("br", broadcast)
     )
 
 
@@ -80,7 +82,7 @@ def write(message: IcpiMessage) -> str:
     args = "".join(f"({number}){_escaped(each)}" for number, each in enumerate(message.args))
     values = (
         _escaped(message.sender),
-        str(message.id),
+        message.id,
         str(int(message.acknowledge)),
         message.function,
         args,
@@ -90,10 +92,10 @@ def write(message: IcpiMessage) -> str:
     return _escaped(message.dest) + fields
 
 
-def id_of(text: str) -> int:
-    """The id of a message that can't be read otherwise, for the answer; 0 if it has none."""
-    found = re.search(r"!id!([0-9]{1,10})!", text)
-    return int(found[1]) if found is not None else 0
+def id_of(text: str) -> str:
+    """The id of a message that can't be read otherwise, for the answer; empty if it has none."""
+    found = re.search(r"!id!([^!\x00-\x1f\x7f]{0,64})!", text)
+    return found[1] if found is not None else ""
 
 
 def _flag(name: str, text: str) -> bool:
@@ -123,10 +125,12 @@ def _escaped(text: str) -> str:
 
 
 def _unescaped(text: str) -> str:
-    def character(found: re.Match[str]) -> str:
-        try:
-            return chr(int(found[1] or "", 16))
-        except ValueError:
-            raise Invalid(f"'{found[0]}' is no escape; write '%25' for '%'") from None
-
-    return _ESCAPE.sub(character, text)
+    if "%" not in text:
+        return text
+    wrong = _NO_ESCAPE.search(text)
+    if wrong is not None:
+        raise Invalid(f"'{wrong[0]}' is no escape; write '%25' for '%'")
+    try:
+        return unquote(text, errors="strict")
+    except UnicodeDecodeError:
+        raise Invalid(f"the escapes of '{text[:40]}' are not UTF-8") from None

@@ -17,6 +17,9 @@ MAX_PROGRAMS = 32
 MAX_NAMES = 256
 """Ports, and functions, of one program."""
 
+REPLY = "reply"
+"""The function of messages that answer others. No program has it."""
+
 RELAY = "relay"
 """The receiver of requests to the relay, and the sender of its own. No program has this name."""
 
@@ -80,7 +83,7 @@ class ProgramRegistry:
         :raises Refused: the user has a program of this name, or too many
         """
         for name in (program.name, *program.ports, *program.functions):
-            if not _NAME.match(name) or name == RELAY:
+            if not _NAME.match(name) or name in (RELAY, REPLY):
                 raise Invalid(f"'{name[:40]}' is no name: it must have letters, digits and '_'")
         if max(len(program.ports), len(program.functions)) > MAX_NAMES:
             raise Invalid(f"a program has {MAX_NAMES} ports and {MAX_NAMES} functions at most")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import secrets
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
@@ -21,7 +20,15 @@ from relay_server.common.errors import NotDone
 from relay_server.common.send_queue import SendQueue
 from relay_server.common.token_bucket import Buckets
 from relay_server.icpi.messages import IcpiMessage, id_of, parse, write
-from relay_server.icpi.programs import RELAY, Program, ProgramRegistry, PublishedValue, function_of, port_of
+from relay_server.icpi.programs import (
+    RELAY,
+    REPLY,
+    Program,
+    ProgramRegistry,
+    PublishedValue,
+    function_of,
+    port_of,
+)
 from relay_server.roles.commands import RoleCommands, RoleUser
 from relay_server.roles.runs import RoleRuns
 from relay_server.roles.schemas import ElementCall, NewElementValue
@@ -107,9 +114,10 @@ class IcpiSession:
         self._unregister: Callable[[], None] | None = None
         self._errors = 0
         self._running = 0
-        self._numbers = itertools.count(1)
-        self._waiting: dict[int, Deferred[str]] = {}
-        """Requests to this program, by id."""
+        self._asked = 0
+        """Requests to this program; their ids are numbers from 1."""
+        self._waiting: dict[str, Deferred[str]] = {}
+        """Those that are not answered yet, by id."""
         self._pinging = PeriodicTimer(self._tick, PING_SECONDS)
         self._ticks = 0
         self._active = False
@@ -132,7 +140,7 @@ class IcpiSession:
         text = payload.decode()
         try:
             message = parse(text)
-            is_reply = message.function == "reply" and message.dest == RELAY
+            is_reply = message.function == REPLY
             # A reply that is waited for does not count: the relay has asked for it.
             if not (is_reply and message.id in self._waiting):
                 self._count()
@@ -142,10 +150,8 @@ class IcpiSession:
         if is_reply:
             self._replied(message)
             return
-        if message.acknowledge:
-            self._send(IcpiMessage(self._receiver, RELAY, message.id, False, "ack"))
         if self._running >= MAX_RUNNING:
-            self._reply(message.id, "error", f"{MAX_RUNNING} requests of yours are in progress; wait for one")
+            self._reply(message, "error", f"{MAX_RUNNING} requests of yours are in progress; wait for one")
             return
         self._running += 1
         work = Deferred.fromCoroutine(self._answer(message, sent))
@@ -208,9 +214,10 @@ class IcpiSession:
             principal = await self._services.authenticate(self._token)
             principal.require_full_scope()
             value = await self._carry_out(message, RoleUser(principal, self._address, sent))
-            self._reply(message.id, "ok", value)
+            if message.acknowledge:
+                self._reply(message, "ok", value)
         except SwitchboardError as error:
-            self._reply(message.id, "error", str(error))
+            self._reply(message, "error", str(error))
         finally:
             self._running -= 1
 
@@ -219,7 +226,7 @@ class IcpiSession:
         if message.broadcast:
             receivers = [each for each in programs.of(self._user) if each.name != self._name]
             for each in receivers:
-                each.notify(message.function, message.args, self._name)
+                each.notify(message.function, message.args, self._sender)
             return str(len(receivers))
         if message.dest == RELAY:
             return self._for_relay(message, user)
@@ -229,7 +236,7 @@ class IcpiSession:
                 port_of(program, _argument(message, 0))
             else:
                 function_of(program, message.function)
-            return await program.request(message.function, message.args, self._name, REPLY_SECONDS)
+            return await program.request(message.function, message.args, self._sender, REPLY_SECONDS)
         return await self._for_role(message, user)
 
     def _for_relay(self, message: IcpiMessage, user: RoleUser) -> str:
@@ -290,10 +297,11 @@ class IcpiSession:
             raise Unavailable(f"program {self._name} has disconnected")
         if len(self._waiting) >= MAX_RUNNING:
             raise Unavailable(f"program {self._name} has {MAX_RUNNING} requests to answer; try again")
-        number = next(self._numbers)
+        self._asked += 1
+        number = str(self._asked)
         waiting: Deferred[str] = Deferred()
         self._waiting[number] = waiting
-        self._send(IcpiMessage(self._name, sender, number, False, function, tuple(args)))
+        self._send(IcpiMessage(self._name, sender, number, True, function, tuple(args)))
         try:
             late = f"program {self._name} did not reply within {seconds:g} s"
             return await with_timeout(self._services.clock, seconds, waiting, late)
@@ -301,10 +309,13 @@ class IcpiSession:
             self._waiting.pop(number, None)
 
     def _notify(self, function: str, args: Iterable[str], sender: str) -> None:
-        self._send(IcpiMessage(self._name, sender, 0, False, function, tuple(args), True))
+        self._send(IcpiMessage(self._name, sender, "", False, function, tuple(args), True))
 
     def _replied(self, message: IcpiMessage) -> None:
         waiting = self._waiting.pop(message.id, None)
+        if waiting is None and self._was_asked(message.id):
+            # It comes too late; who asked has an error already.
+            return
         if waiting is None or len(message.args) != 2 or message.args[0] not in ("ok", "error"):
             if waiting is not None:
                 waiting.errback(NotDone(f"program {self._name} gave a reply that can't be read"))
@@ -317,20 +328,26 @@ class IcpiSession:
             waiting.errback(NotDone(f"{self._name}: {message.args[1][:500]}"))
 
     @property
-    def _receiver(self) -> str:
+    def _sender(self) -> str:
+        """What others reply to."""
         return self._name or "program"
+
+    def _was_asked(self, id: str) -> bool:
+        return id.isascii() and id.isdigit() and 1 <= int(id) <= self._asked
 
     # --- sending ------------------------------------------------------------------------------------------
 
-    def _reply(self, id: int, result: str, value: str) -> None:
-        self._send(IcpiMessage(self._receiver, RELAY, id, False, "reply", (result, value)))
+    def _reply(self, request: IcpiMessage, result: str, value: str) -> None:
+        """The request's form, with sender and receiver exchanged."""
+        receiver, sender = request.sender or self._sender, request.dest or RELAY
+        self._send(IcpiMessage(receiver, sender, request.id, False, REPLY, (result, value)))
 
-    def _refuse(self, id: int, error: SwitchboardError) -> None:
+    def _refuse(self, id: str, error: SwitchboardError) -> None:
         self._errors += 1
         if self._errors > MAX_ERRORS:
             self.close(close_codes.TOO_MANY_ERRORS, f"{MAX_ERRORS} errors; the last one: {error}"[:120])
         else:
-            self._reply(id, "error", str(error))
+            self._reply(IcpiMessage(RELAY, "", id, False, REPLY), "error", str(error))
 
     def _send(self, message: IcpiMessage) -> None:
         if not self._closed:

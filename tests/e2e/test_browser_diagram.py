@@ -64,7 +64,7 @@ def test_a_topic_calls_a_service_and_a_program_is_a_box(world: DiagramWorld, pag
     url = world.url.replace("http", "ws") + "/icpi"
     user = UserInput(page)
     with connect(url, additional_headers=headers) as program:
-        register = IcpiMessage("relay", "", 1, False, "register", ("lamp", '["power"]', '["blink"]'))
+        register = IcpiMessage("relay", "", "1", True, "register", ("lamp", '["power"]', '["blink"]'))
         program.send(write(register))
         for source, target in (
             ("robot:pad /temperature", "robot:rover /beep()"),

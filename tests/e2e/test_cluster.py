@@ -372,7 +372,7 @@ def test_elements_of_roles_at_another_relay_take_commands(fleet: Fleet) -> None:
     with connect(icpi, additional_headers=headers, open_timeout=PATIENCE) as program:
 
         def request(function: str, *args: str) -> tuple[str, ...]:
-            program.send(write(IcpiMessage(ROLE, "test", 1, False, function, args)))
+            program.send(write(IcpiMessage(ROLE, "test", "1", True, function, args)))
             return parse(str(program.recv(PATIENCE))).args
 
         assert request("call", "SAID") == ("ok", '"hello"')

@@ -161,7 +161,7 @@ def test_a_number_that_is_not_finite_moves_no_robot_by_icpi(world: World) -> Non
     ) as program:
 
         def refusal() -> str:
-            program.send(write(IcpiMessage(ROLE, "test", 1, False, "set", ("SPEED", "NaN"))))
+            program.send(write(IcpiMessage(ROLE, "test", "1", True, "set", ("SPEED", "NaN"))))
             result, words = parse(str(program.recv(PATIENCE))).args
             assert result == "error"
             # Until a ping proves how old its messages are; commands are limited for each user.

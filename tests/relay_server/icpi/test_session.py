@@ -14,7 +14,7 @@ from relay_server.icpi.session import IcpiServices, IcpiSession
 from relay_server.roles.commands import RoleUser, arguments_of
 from relay_server.roles.schemas import ElementDone, NewElementValue
 
-REQUEST = write(IcpiMessage("relay", "test", 1, False, "programs")).encode()
+REQUEST = write(IcpiMessage("relay", "test", "1", True, "programs")).encode()
 
 
 class Transport:
@@ -83,7 +83,7 @@ def _set(commands: Commands, text: str) -> tuple[str, ...]:
     services = IcpiServices(clock, ProgramRegistry(), cast(Any, commands), unused, authenticate, lambda: 0)
     transport = Transport()
     session = IcpiSession(services, cast(Any, transport), principal(1), "1", "here", lambda _: None)
-    session.message(write(IcpiMessage("Role", "test", 1, False, "set", ("SPEED", text))).encode())
+    session.message(write(IcpiMessage("Role", "test", "1", True, "set", ("SPEED", text))).encode())
     return transport.results[0]
 
 
