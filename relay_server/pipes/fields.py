@@ -106,7 +106,7 @@ def convert(value: Any, target_type: str, name: str) -> Any:
     if target_type == ANY:
         return value
     if target_type in _STRINGS:
-        return value if isinstance(value, str) else _text_of(value)
+        return _text_of(value, name)
     if not isinstance(value, bool | int | float):
         raise Invalid(f"{name} takes no {_kind(value)}")
     if target_type == "bool":
@@ -159,7 +159,7 @@ def _carrier(mapping: FieldMapping, target_type: str) -> Callable[[Any, dict[str
         except (LookupError, TypeError):
             raise Invalid(f"the message has no '{mapping.source}'") from None
         if mapping.table:
-            key = value if isinstance(value, str) else _text_of(value)
+            key = _text_of(value, f"the table of '{mapping.source}'")
             if key not in mapping.table:
                 raise Invalid(f"'{key[:40]}' of '{mapping.source}' is not in the table")
             value = mapping.table[key]
@@ -197,10 +197,17 @@ def _rounded(value: float, name: str) -> int:
     return round(value)
 
 
-def _text_of(value: Any) -> str:
-    """A value as text, by which tables find it: ``true``, ``7``, ``0.5``."""
+def _text_of(value: Any, name: str) -> str:
+    """A value as text, by which tables find it: ``true``, ``7``, ``0.5``.
+
+    :raises Invalid: it is a list, an object or nothing, as NaN is in JSON
+    """
+    if isinstance(value, str):
+        return value
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
-    return str(value)
+    if isinstance(value, int | float):
+        return str(value)
+    raise Invalid(f"{name} takes no {_kind(value)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -54,6 +55,10 @@ MAX_USERS = 1000
 
 ELSEWHERE = "waiting for the relay that its target robot is connected to"
 """Why a pipe waits, as another relay of the cluster than that of its target robot knows it."""
+
+
+_OF_ROLES = re.compile(r"role-[0-9]+-[0-9]+\Z")
+"""Names that a Role gives to the pipes of its mappings."""
 
 
 class PipeCycle(Refused):
@@ -189,6 +194,8 @@ class PipeService:
         """
         if counted:
             self._count(user)
+            if _OF_ROLES.match(new.name):
+                raise Invalid(f"names such as {new.name} are for the pipes of Roles; choose another name")
         _check_settings(new)
         record = await self._database.write(self._add, user, new, owner)
         if not new.start:
@@ -326,19 +333,25 @@ class PipeService:
         return record
 
     def _enable(self, s: Session, user: PipeUser, record: PipeRecord) -> None:
-        others = [_edge(each) for each in queries.list_pipes(s) if each.enabled and each.id != record.id]
+        others = [
+            _edge(each, shown=_may_see(user, each))
+            for each in queries.list_pipes(s)
+            if each.enabled and each.id != record.id
+        ]
         cycle = find_cycle(_edge(record), others)
         if cycle:
             raise PipeCycle(
                 f"pipe '{record.name}' would feed itself ({' → '.join(cycle)} → {cycle[0]}); give one of them a rate"
             )
-        if not queries.enable_pipe(s, record.id, True):
+        new = queries.enable_pipe(s, record.id, True)
+        if new is None:
             raise NotFound(f"there is no pipe '{record.name}'")
-        self._audit(s, user.actor, "pipe.start", record, user.address)
+        if new:
+            self._audit(s, user.actor, "pipe.start", record, user.address)
 
     def _disable(self, s: Session, user: PipeUser, record: PipeRecord) -> None:
-        queries.enable_pipe(s, record.id, False)
-        self._audit(s, user.actor, "pipe.stop", record, user.address)
+        if queries.enable_pipe(s, record.id, False):
+            self._audit(s, user.actor, "pipe.stop", record, user.address)
 
     def _remove(self, s: Session, user: PipeUser, record: PipeRecord) -> None:
         if queries.remove_pipe(s, record.id):
@@ -602,10 +615,11 @@ def _robot_ends(settings: PipeSettings) -> tuple[PipeEnd, PipeEnd]:
     return target if source.program else source, source if target.program else target
 
 
-def _edge(record: PipeRecord) -> PipeEdge:
+def _edge(record: PipeRecord, *, shown: bool = True) -> PipeEdge:
+    """:param shown: whether errors may name the pipe"""
     settings = settings_of(record)
     return PipeEdge(
-        record.name,
+        record.name if shown else "a pipe of another user",
         end_key(settings.source, record.source_robot_id, record.owner_id),
         end_key(settings.target, record.target_robot_id, record.owner_id),
         settings.rate > 0,

@@ -607,6 +607,7 @@ class TestRights:
         """
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
+        relay.until(lambda: relay.log(op="watch"), "no camera was watched")
         relay.do(close=4403, reason="revoked by admin", clear_log=True)
         expect(seen(page, "link-banner")).to_have_text(
             "You no longer have a right to this robot. Revoked by admin."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from sqlalchemy import delete, func, insert, select, update
+from sqlalchemy import delete, func, insert, or_, select, update
 from sqlalchemy.orm import Session
 
 from relay_db.models import Pipe, Realm, User
@@ -17,6 +17,8 @@ from relay_protocol.realms import full_name
 
 MAX_PIPES = 1000
 """Most pipes of one realm."""
+
+MAX_PIPES_OF_USER = 500
 
 
 class NewPipeRow(NamedTuple):
@@ -37,7 +39,7 @@ def add_pipe(s: Session, new: NewPipeRow) -> PipeRecord:
 
     :raises NotFound: the owner was removed
     :raises Invalid: the realm has a pipe of this name
-    :raises Refused: the realm has too many
+    :raises Refused: the realm or the owner has too many
     """
     realm_id = s.scalar(select(User.realm_id).where(User.id == new.owner_id).with_for_update())
     if realm_id is None:
@@ -47,6 +49,9 @@ def add_pipe(s: Session, new: NewPipeRow) -> PipeRecord:
     count = s.scalar(select(func.count()).select_from(Pipe).where(Pipe.realm_id == realm_id)) or 0
     if count >= MAX_PIPES:
         raise Refused(f"the realm has {MAX_PIPES} pipes, the most it may have; remove one")
+    own = s.scalar(select(func.count()).select_from(Pipe).where(Pipe.owner_id == new.owner_id)) or 0
+    if own >= MAX_PIPES_OF_USER:
+        raise Refused(f"{MAX_PIPES_OF_USER} pipes are the most that one user may have; remove one")
     s.execute(insert(Pipe).values(realm_id=realm_id, moves=False, reason="", **new._asdict()))
     (added,) = [each for each in list_pipes(s) if each.name == new.name and each.owner_id == new.owner_id]
     return added
@@ -81,8 +86,8 @@ def list_pipes(s: Session) -> list[PipeRecord]:
 
 def enable_pipe(
     s: Session, pipe_id: int, enabled: bool, *, reason: str = "", moves: bool | None = None
-) -> bool:
-    """Store whether a pipe is to run; false if there is none of this number.
+) -> bool | None:
+    """Store whether a pipe is to run; whether that is new, or ``None`` if there is none of this number.
 
     :param reason: why it ended, if the relay ended it
     :param moves: whether it moves a robot; ``None``: as before
@@ -90,8 +95,11 @@ def enable_pipe(
     values = {"enabled": enabled, "reason": sanitise(reason)}
     if moves is not None:
         values["moves"] = moves
-    changed = update(Pipe).where(Pipe.id == pipe_id).values(**values).returning(Pipe.id)
-    return s.scalar(changed) is not None
+    old = [getattr(Pipe, name) != value for name, value in values.items()]
+    changed = update(Pipe).where(Pipe.id == pipe_id, or_(*old)).values(**values).returning(Pipe.id)
+    if s.scalar(changed) is not None:
+        return True
+    return None if s.scalar(select(Pipe.id).where(Pipe.id == pipe_id)) is None else False
 
 
 def remove_pipe(s: Session, pipe_id: int) -> bool:

@@ -115,6 +115,9 @@ def test_values_become_those_of_another_type(value: Any, kind: str, result: Any)
         ({}, "float64"),
         ([1], "bool"),
         (10**400, "float64"),
+        (None, "string"),
+        ([1], "string"),
+        ({"a": 1}, "string"),
     ],
 )
 def test_values_that_do_not_fit_are_refused(value: Any, kind: str) -> None:

@@ -199,6 +199,38 @@ async def test_cycles_are_refused_unless_a_rate_breaks_them(scene: PipeScene) ->
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_cycle_does_not_name_the_pipes_of_others(scene: PipeScene) -> None:
+    ann = await scene.begin()
+    await scene.service.add(ann, copy("secret"))
+    user = await another(scene)
+    await scene.front.store.write(queries.grant_right, scene.front.rover.id, "operator", user_id=user.id)
+    bob = pipe_user(await scene.front.by_token(user), HERE)
+    with pytest.raises(Refused, match=r"feed itself \(back → a pipe of another user → back\)"):
+        await scene.service.add(bob, copy("back", "/copy", "/chatter"))
+
+
+@pytest_twisted.ensureDeferred
+async def test_one_user_has_so_many_pipes_at_most(scene: PipeScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    ann = await scene.begin()
+    monkeypatch.setattr("relay_db.queries.pipes.MAX_PIPES_OF_USER", 1)
+    await scene.service.add(ann, copy("first"))
+    with pytest.raises(Refused, match="most that one user may have"):
+        await scene.service.add(ann, copy("second"))
+    with pytest.raises(Invalid, match="are for the pipes of Roles"):
+        await scene.service.add(ann, copy("role-1-1"))
+
+
+@pytest_twisted.ensureDeferred
+async def test_repeated_stops_are_audited_once(scene: PipeScene) -> None:
+    ann = await scene.begin()
+    await scene.service.add(ann, copy())
+    for _ in range(5):
+        await scene.service.stop_pipe(ann, "copy")
+    actions = [each.action for each in await scene.front.store.read(queries.list_audit)]
+    assert [each for each in actions if each.startswith("pipe.")] == ["pipe.stop", "pipe.start", "pipe.add"]
+
+
+@pytest_twisted.ensureDeferred
 async def test_robots_without_a_right_can_not_be_named(scene: PipeScene) -> None:
     ann = await scene.begin()
     for robot in ("hidden", "nowhere", "rover@nowhere"):

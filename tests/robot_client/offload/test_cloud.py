@@ -153,12 +153,17 @@ def test_a_link_that_is_closed_while_it_is_dialled_stays_closed(slow: tuple[Clou
     assert client._connection is None
 
 
+def _is_sent_alone(client: Cloud) -> bool:
+    connection = client._connection
+    return connection is not None and bool(connection._replies) and not connection._waiting
+
+
 def test_calls_of_two_cameras_do_not_replace_each_other(slow: tuple[Cloud, socket.socket]) -> None:
     client, _ = slow
     frame = bytes(1_000_000)
     with ThreadPoolExecutor(4) as pool:
         first = pool.submit(client.call, "look", timeout=60, newest="front", frame=frame)
-        wait_for("the first is being sent", lambda: client._connection and client._connection._replies)
+        wait_for("the first is being sent", lambda: _is_sent_alone(client))
         front = pool.submit(client.call, "look", timeout=60, newest="front", frame=frame)
         wait_for("the second waits", lambda: client._connection and client._connection._waiting)
         rear = pool.submit(client.call, "look", timeout=60, newest="rear", frame=frame)
@@ -188,7 +193,7 @@ def test_an_older_frame_stays_if_there_is_no_room_for_the_newer(slow: tuple[Clou
     client, _ = slow
     with ThreadPoolExecutor(2) as pool:
         first = pool.submit(client.call, "look", timeout=60, newest=True, frame=bytes(1_000_000))
-        wait_for("the first is being sent", lambda: client._connection and client._connection._replies)
+        wait_for("the first is being sent", lambda: _is_sent_alone(client))
         older = pool.submit(client.call, "look", timeout=60, newest=True, frame=bytes(1_000_000))
         wait_for("the second waits", lambda: client._connection and client._connection._waiting)
         with pytest.raises(Unavailable, match="bytes of calls wait"):
