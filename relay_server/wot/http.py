@@ -13,7 +13,6 @@ from relay_server.http.endpoint import ApiRequest, Document, endpoint
 from relay_server.http.media_types import MediaType
 from relay_server.http.openapi.operation import Credential
 from relay_server.resources.representations import caller_at
-from relay_server.resources.states import ResourceLocation
 from relay_server.wot.description import directory_description
 from relay_server.wot.service import ThingService
 
@@ -80,8 +79,8 @@ class ThingEndpoints:
         "GET",
         THINGS,
         tag="things",
-        summary="Thing Descriptions of the robots and devices the caller has a right on",
-        more="In the order of names. `Link` has the address of the next page.",
+        summary="Thing Descriptions of the robots, devices and Roles the caller may see",
+        more="Roles come last, each in the order of names. `Link` has the address of the next page.",
         returns="a list of descriptions",
         forms=(LIST,),
         headers={"Link": "address of the next page, with `rel=next`"},
@@ -101,7 +100,7 @@ class ThingEndpoints:
         f"{THINGS}/{{id}}",
         tag="things",
         summary="The Thing Description with this id",
-        more="It is redirected to the address of the robot's description.",
+        more="It is redirected to the address of the description.",
         returns={307: "its address is in `Location`"},
         names={"id": "`id` of a Thing"},
         forms=(TD,),
@@ -109,8 +108,7 @@ class ThingEndpoints:
         errors=(404,),
     )
     async def thing(self, request: ApiRequest, id: str) -> Document:
-        robot = await self._service.robot_of(request.principal, id, request.base)
-        location = f"{ResourceLocation('', robot).address}/td"
+        location = await self._service.address_of(request.principal, id, request.base)
         return Document(b"", TD.media, headers={"location": location}, status=307)
 
     @endpoint(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+from relay_protocol.errors import Invalid, Refused
 from relay_protocol.link import Service, Topic
 from relay_protocol.rights import Operation, Rules
 from relay_server.relay_node.visible_graph import VisibleGraph
-from relay_server.roles.bindings import COMMANDS, KINDS, Binding, Command, binding_of
+from relay_server.roles.bindings import COMMANDS, Binding, Command, binding_of, choose
 from relay_server.roles.commands import BOOL, SET_BOOL, TRIGGER
 from relay_server.roles.schemas import RoleElement
 from relay_server.wot.description import (
@@ -98,8 +99,9 @@ def _affordances(elements: Iterable[RoleElement], robots: Robots, place: str) ->
     properties: dict[str, Any] = {"role-state": _role_state(place)}
     actions: dict[str, Any] = {f"{each}-role": _role_order(place, each) for each in ("start", "stop")}
     by_name = {each.name: each for each in elements}
+    mapped = _mapped(by_name)
     for element in by_name.values():
-        commands = _commands(element, by_name, robots)
+        commands = _commands(element, [by_name[each] for each in mapped(element.name)], robots)
         href = f"{place}/elements/{quote(element.name, safe='')}"
         if len(properties) < MAX_AFFORDANCES and not commands.isdisjoint({"get", "set"}):
             properties[element.name] = _value(element, href, commands)
@@ -108,11 +110,29 @@ def _affordances(elements: Iterable[RoleElement], robots: Robots, place: str) ->
     return {"properties": properties, "actions": actions}
 
 
-def _commands(element: RoleElement, elements: Mapping[str, RoleElement], robots: Robots) -> set[Command]:
+def _mapped(elements: Mapping[str, RoleElement]) -> Callable[[str], list[str]]:
+    """Finds the names of other elements that one is mapped to, over any number of mappings and either way."""
+    joined: dict[str, set[str]] = {name: set() for name in elements}
+    for name, element in elements.items():
+        for other in element.mappings:
+            joined[name].add(other)
+            joined.setdefault(other, set()).add(name)
+
+    def find(name: str) -> list[str]:
+        seen, waiting = {name}, [name]
+        while waiting:
+            new = joined[waiting.pop()] - seen
+            seen |= new
+            waiting += new
+        return sorted((seen - {name}) & elements.keys())
+
+    return find
+
+
+def _commands(element: RoleElement, mapped: list[RoleElement], robots: Robots) -> set[Command]:
     """Commands that an element takes, by its own resources or those of elements that it is mapped to."""
-    own = _bindings([element])
-    mapped = _bindings(elements[each] for each in element.mappings if each in elements)
-    return {each for each in COMMANDS if _takes(own, each, robots) or _takes(mapped, each, robots)}
+    own, others = _bindings([element]), _bindings(mapped)
+    return {each for each in COMMANDS if _takes(own, others, each, robots)}
 
 
 def _bindings(elements: Iterable[RoleElement]) -> list[Binding]:
@@ -120,12 +140,12 @@ def _bindings(elements: Iterable[RoleElement]) -> list[Binding]:
     return list(dict.fromkeys(each for each in found if each is not None))
 
 
-def _takes(bindings: list[Binding], command: Command, robots: Robots) -> bool:
-    """Whether a command goes to exactly one of these, and the reader has the right."""
-    fitting = [each for each in bindings if each.kind in KINDS[command]]
-    if len(fitting) != 1:
+def _takes(own: list[Binding], others: list[Binding], command: Command, robots: Robots) -> bool:
+    """Whether a command goes to exactly one resource, and the reader has the right."""
+    try:
+        binding = choose("", command, own, others)
+    except (Invalid, Refused):
         return False
-    (binding,) = fitting
     if not binding.robot:
         return True
     robot = robots.get(binding.robot)

@@ -6,10 +6,12 @@ from collections import OrderedDict, deque
 from collections.abc import Iterable
 from contextlib import suppress
 from typing import NamedTuple
+from urllib.parse import quote
 
 from relay_db.queries import RobotRecord
 from relay_protocol import jsontext, link
 from relay_protocol.errors import NotFound, SwitchboardError
+from relay_protocol.realms import full_name
 from relay_protocol.rights import Operation, Rules
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.access import NO_ROBOT, Access, Principal, may_subscribe
@@ -21,6 +23,7 @@ from relay_server.modules.robot_modules import ModuleRegistry
 from relay_server.relay_node import interfaces
 from relay_server.relay_node.rosapi import known
 from relay_server.relay_node.visible_graph import VisibleGraph, graph_by_rules
+from relay_server.resources.states import ResourceLocation
 from relay_server.robots.registry import OwnEndpoints, RobotRegistry, RobotState
 from relay_server.roles.service import RoleService
 from relay_server.wot.data_schema import Schema, data_schema
@@ -141,36 +144,50 @@ class ThingService:
         await self._readable(principal, robot)
 
     async def page(self, principal: Principal, address: str, base: str, offset: int, limit: int) -> ThingPage:
-        """Descriptions of robots in the order of their names.
+        """Descriptions of robots in the order of their names, and then of Roles.
 
         :param address: the reader's
         :param offset: number of the first one
         :param limit: most descriptions
         """
-        names = sorted(record.name for record, _ in await self._access.robots(principal))
+        robots = sorted(record.name for record, _ in await self._access.robots(principal))
+        things = [
+            *((True, each) for each in robots),
+            *((False, each) for each in await self._seen(principal)),
+        ]
         found: list[bytes] = []
         size = 0
-        for name in names[offset : offset + limit]:
+        for is_robot, name in things[offset : offset + limit]:
             try:
-                body = await self.robot(RobotCaller(principal, name, address), base)
+                if is_robot:
+                    body = await self.robot(RobotCaller(principal, name, address), base)
+                else:
+                    body = await self.role(principal, name, base)
             except NotFound:
-                # Its rights were revoked meanwhile.
+                # Its rights were revoked meanwhile, or it was removed.
                 body = b""
             size += len(body)
             if found and size > MAX_PAGE_BYTES:
                 break
             found.append(body)
         after = offset + len(found)
-        return ThingPage([each for each in found if each], after if after < len(names) else None)
+        return ThingPage([each for each in found if each], after if after < len(things) else None)
 
-    async def robot_of(self, principal: Principal, thing: str, base: str) -> str:
-        """The name of the robot with this id.
+    async def _seen(self, principal: Principal) -> list[str]:
+        """Names of the Roles that a reader sees."""
+        return sorted(await self._roles.roles(principal))
+
+    async def address_of(self, principal: Principal, thing: str, base: str) -> str:
+        """The address of the description with this id.
 
         :raises NotFound: there is none that the principal has a right on
         """
         for record, _ in await self._access.robots(principal):
             if thing_id(base, "robots", record.full) == thing:
-                return record.name
+                return f"{ResourceLocation('', record.name).address}/td"
+        for name in await self._seen(principal):
+            if thing_id(base, "roles", full_name(name, principal.realm)) == thing:
+                return f"/api/v1/roles/{quote(name, safe='')}/td"
         raise NotFound("there is no Thing of this id, or none that you may see")
 
     async def _readable(self, principal: Principal, name: str) -> _Readable:
@@ -248,7 +265,7 @@ class ThingService:
         """
         robots = await self._robots(principal)
         elements = await self._roles.elements(principal, name)
-        full = f"{name}@{principal.realm}"
+        full = full_name(name, principal.realm)
         description = role_description(name, full, elements, robots, base)
         return jsontext.encode(with_types(description) if typed else description)
 

@@ -53,6 +53,13 @@ def test_an_element_takes_the_commands_of_what_it_is_mapped_to() -> None:
     assert mapped[0] == {"A", "B"}
 
 
+def test_mappings_lead_on_and_either_way_as_for_commands() -> None:
+    chain = [element("A"), element("B", mappings=("A", "C")), element("C", "topics/joy")]
+    assert affordances(Level.VIEWER, *chain)[0] == {"A", "B", "C"}
+    several = element("A", "topics/joy", "topics/lamp", mappings=("B",)), element("B", "topics/joy")
+    assert affordances(Level.VIEWER, *several)[0] == {"B"}
+
+
 def test_only_commands_that_the_reader_may_send_appear() -> None:
     elements = element("JOY", "topics/joy"), element("BEEP", "services/beep")
     properties, actions, found = affordances(Level.VIEWER, *elements)

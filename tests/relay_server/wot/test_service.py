@@ -13,6 +13,7 @@ from relay_protocol import link
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
 from relay_server.in_process_sessions.pool import InProcessSessionPool, RobotCaller
+from relay_server.roles.schemas import RoleElement
 from relay_server.wot.service import ThingService
 from tests.worlds.relay import GRAPH, STRING, TEXTS, TRIGGER, TWIST
 from tests.worlds.session_manager import HERE, SessionsWorld
@@ -21,11 +22,27 @@ BASE = "https://relay.example"
 MANY = [f"/many/t{number}" for number in range(600)]
 
 
+class Roles:
+    """The reader sees one Role."""
+
+    async def roles(self, principal: Principal) -> dict[str, None]:
+        return {"Pad-Drive-Rover": None}
+
+    async def elements(self, principal: Principal, name: str) -> list[RoleElement]:
+        return [RoleElement("CHAT", [], ["robots/rover/topics/chatter"], [])]
+
+
 def service_of(front: SessionsWorld) -> ThingService:
     world = front.world
     pool = InProcessSessionPool(world.clock, front.service)
     return ThingService(
-        world.clock, front.access, world.registry, world.channels, pool, cast(Any, None), front.world.modules
+        world.clock,
+        front.access,
+        world.registry,
+        world.channels,
+        pool,
+        cast(Any, Roles()),
+        front.world.modules,
     )
 
 
@@ -142,13 +159,17 @@ async def test_robots_without_a_right_are_unknown(front: SessionsWorld) -> None:
     with pytest.raises(NotFound):
         await service.robot(RobotCaller(ann, "hidden", HERE), BASE)
     page = await service.page(ann, HERE, BASE, 0, 10)
-    assert [msgspec.json.decode(each)["title"] for each in page.things] == ["rover"]
+    assert [msgspec.json.decode(each)["title"] for each in page.things] == ["rover", "Pad-Drive-Rover"]
     assert page.next is None
     assert (await service.page(ann, HERE, BASE, 5, 10)).things == []
-    thing = msgspec.json.decode(page.things[0])["id"]
-    assert await service.robot_of(ann, thing, BASE) == "rover"
+    first = await service.page(ann, HERE, BASE, 0, 1)
+    assert (len(first.things), first.next) == (1, 1)
+    thing, role = (msgspec.json.decode(each) for each in page.things)
+    assert "CHAT" in role["properties"]
+    assert await service.address_of(ann, thing["id"], BASE) == "/api/v1/robots/rover/td"
+    assert await service.address_of(ann, role["id"], BASE) == "/api/v1/roles/Pad-Drive-Rover/td"
     with pytest.raises(NotFound):
-        await service.robot_of(ann, thing[:-1], BASE)
+        await service.address_of(ann, thing["id"][:-1], BASE)
 
 
 @pytest_twisted.ensureDeferred
