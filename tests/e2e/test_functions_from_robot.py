@@ -13,10 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import pytest_twisted
+from twisted.internet.defer import CancelledError
+from twisted.internet.threads import deferToThread
 
 from relay_protocol.errors import Unavailable
 from relay_protocol.functions import CallFailed, function
 from robot_client.offload import Cloud, Device, DeviceState, decisions, offload
+from robot_client.offload.deferred import DeferredCloud
 from robot_client.offload.device import publish
 from robot_client.offload.function_link import Overtaken
 from robot_client.services.placement import CameraImage, RunOptions, file_of, marker_function
@@ -93,6 +97,28 @@ def test_a_call_without_a_result_is_an_exception(
     with pytest.raises(CallFailed) as failed:
         world.cloud.call(name, timeout=30, **arguments)
     assert failed.value.code == code
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_program_on_the_reactor_waits_by_deferreds(world: RobotProgram) -> None:
+    workers = DeferredCloud(world.cloud)
+    calls = [workers.call("add", a=number, b=1, timeout=60) for number in range(20)]
+    assert [(await each)["sum"] for each in calls] == list(range(1, 21))
+    handle = await workers.submit("add", a=2, b=2)
+    assert (await workers.result(handle, 60))["sum"] == 4
+
+    @offload("add", client=world.cloud, state=world.device, version=1)
+    def add(a: float, b: float = 1.0) -> float:
+        return a + b
+
+    assert await workers.run(add, 4) == 5
+    with pytest.raises(CallFailed):
+        await workers.call("no_such_function", timeout=60)
+    lost = workers.call("add", a=1, b=1, timeout=60)
+    lost.cancel()
+    with pytest.raises(CancelledError):
+        await lost
+    await deferToThread(workers.close)
 
 
 def test_a_submitted_job_outlasts_the_link(world: RobotProgram, tmp_path: Path) -> None:

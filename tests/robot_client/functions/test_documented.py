@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy
 import pytest
+import pytest_twisted
+from twisted.internet.threads import deferToThread
 
 from relay_protocol.functions import FunctionRegistry
 from robot_client.offload import cloud, decisions
 from tests.worlds.doc_examples import programs
 
-CALLS, FUNCTION = (each.text for each in programs(Path(__file__).parents[3] / "docs/guides/offload.md"))
+CALLS, DEFERRED, FUNCTION = (
+    each.text for each in programs(Path(__file__).parents[3] / "docs/guides/offload.md")
+)
 
 
 def test_the_calls_of_the_document(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -32,6 +37,16 @@ def test_the_calls_of_the_document(monkeypatch: pytest.MonkeyPatch) -> None:
     scope["detect"].where = "here"
     assert scope["detect"](b"jpeg") == []
     assert decisions()
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_calls_by_deferreds_of_the_document(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cloud, "call", lambda name, timeout, **arguments: (name, arguments, timeout > 1))
+    scope: dict[str, Any] = {"jpeg": b"jpeg", "detect": lambda image: ["found", image]}
+    await eval(compile(DEFERRED, "document", "exec", ast.PyCF_ALLOW_TOP_LEVEL_AWAIT), scope)
+    assert scope["faces"] == ("detect_faces", {"image": b"jpeg"}, True)
+    assert scope["found"] == ["found", b"jpeg"]
+    await deferToThread(scope["workers"].close)
 
 
 def test_the_function_of_the_document_is_loaded_from_a_folder(tmp_path: Path) -> None:

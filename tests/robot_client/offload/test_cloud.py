@@ -13,12 +13,17 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+import pytest_twisted
+from twisted.internet import reactor
+from twisted.internet.task import deferLater
+from twisted.internet.threads import deferToThread
 
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from relay_protocol.function_link import FunctionReply
 from relay_protocol.functions import CallFailed
 from robot_client.offload import Device, DeviceState, function_link, offload
 from robot_client.offload.cloud import Cloud, result_of
+from robot_client.offload.deferred import DeferredCloud
 from robot_client.offload.device import publish
 from robot_client.offload.function_link import FunctionConnection, Overtaken
 from tests.worlds.waiting import wait_for
@@ -240,3 +245,22 @@ def test_a_state_counts_while_it_is_new(tmp_path: Path, at: float, critical: boo
     """Also on a robot whose clock was set back."""
     publish(tmp_path, DeviceState(at, {"cpu": True}))
     assert Device(tmp_path, lambda: 1000.0).critical("cpu") is critical
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_time_of_a_call_covers_the_wait_for_a_turn() -> None:
+    workers, begun, goes = DeferredCloud(Cloud(), threads=1), threading.Event(), threading.Event()
+
+    def busy() -> None:
+        begun.set()
+        goes.wait(60)
+
+    first = workers.run(busy)
+    await deferToThread(begun.wait, 60)
+    second = workers.call("look", timeout=0.01)
+    await deferLater(reactor, 0.05, lambda: None)
+    goes.set()
+    await first
+    with pytest.raises(Unavailable, match=r"look was not begun in 0\.01 s"):
+        await second
+    await deferToThread(workers.close)
