@@ -57,7 +57,7 @@ class Relay:
         step = LifecycleStep
         return [
             step(name="database", start=core.open_database, join=core.database.stop),
-            step(name="files", start=core.files.start, join=core.files.pool.stop),
+            step(name="files", start=core.files.start, join=core.files.stop),
             step(
                 name="conversions",
                 start=services.conversions.start,

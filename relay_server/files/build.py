@@ -22,6 +22,9 @@ from relay_server.robots.tickets import Tickets
 
 FOLDER = "files"
 THREADS = 4
+STORING_THREADS = 4
+"""For whole files, which take long with an S3-compatible storage; the others go on with parts and downloads."""
+
 WAITING = 4096
 """Most pieces of work with the disk that run or wait."""
 
@@ -31,6 +34,7 @@ class FileCore:
     """The parts of a relay that receive and keep files."""
 
     pool: BoundedThreadPool
+    storing: BoundedThreadPool
     incoming: IncomingFolder
     storage: FileStorage
     uploads: Uploads
@@ -46,6 +50,12 @@ class FileCore:
         except OSError as error:
             raise Invalid(f"the folder of files can't be used: {error.strerror}") from None
         self.pool.start()
+        self.storing.start()
+
+    def stop(self) -> None:
+        """Finish all work with the disk and the storage; blocks for as long as that takes."""
+        self.storing.stop()
+        self.pool.stop()
 
 
 def open_storage(folder: Path, url: str) -> FileStorage:
@@ -64,12 +74,13 @@ def build_files(reactor: Any, settings: RelaySettings, database: AsyncDatabase, 
     folder = settings.data / FOLDER
     storage = open_storage(folder, files.storage)
     incoming = IncomingFolder(folder / "incoming", storage, files.reserve)
-    pool = BoundedThreadPool(
-        reactor, "files", THREADS, WAITING, "too many files are being written; try again in a moment"
-    )
+    overload = "too many files are being written; try again in a moment"
+    pool = BoundedThreadPool(reactor, "files", THREADS, WAITING, overload)
+    storing = BoundedThreadPool(reactor, "storing files", STORING_THREADS, WAITING, overload)
     uploads = Uploads(
         database=database,
         pool=pool,
+        storing=storing,
         incoming=incoming,
         storage=storage,
         quotas=FileQuotas(files.robot, files.realm, files.relay),
@@ -77,4 +88,4 @@ def build_files(reactor: Any, settings: RelaySettings, database: AsyncDatabase, 
         wall=time.time,
     )
     links = FileLinks(uploads, Tickets(reactor, passwords.new_token))
-    return FileCore(pool, incoming, storage, uploads, links)
+    return FileCore(pool, storing, incoming, storage, uploads, links)

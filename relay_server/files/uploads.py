@@ -76,6 +76,7 @@ class Uploads:
     """All uploads of a relay.
 
     :param pool: threads for the disk
+    :param storing: threads that store and hash whole files
     :param wall: Unix time in seconds
     :ivar version: changes with each upload that begins, goes on or ends
     """
@@ -87,6 +88,7 @@ class Uploads:
         *,
         database: AsyncDatabase,
         pool: BoundedThreadPool,
+        storing: BoundedThreadPool,
         incoming: IncomingFolder,
         storage: FileStorage,
         quotas: FileQuotas,
@@ -95,6 +97,7 @@ class Uploads:
     ) -> None:
         self._database = database
         self.pool = pool
+        self._storing = storing
         self._incoming = incoming
         self._storage = storage
         self._quotas = quotas
@@ -164,7 +167,7 @@ class Uploads:
         # number that the database does not know, because an older state of it was restored.
         if (
             stored == file.size
-            and await self.on_disk(hash_of_stored, self._storage, str(file.id)) == file.sha256
+            and await self._with_whole_file(hash_of_stored, self._storage, str(file.id)) == file.sha256
         ):
             await self._listed(file)
             await self.on_disk(self._incoming.delete, str(file.id))
@@ -190,7 +193,8 @@ class Uploads:
         """
         file = upload.file
         try:
-            await self.on_disk(self._incoming.store, incoming, str(file.id), file.size, file.sha256)
+            work = self._incoming.store
+            await self._with_whole_file(work, incoming, str(file.id), file.size, file.sha256)
         except WrongContents:
             reason = "what arrived is not what was offered: the file has changed, or the transfer was damaged"
             raise UploadRefused("mismatch", reason, SOON_SECONDS) from None
@@ -212,6 +216,11 @@ class Uploads:
         """
         with self._disk_errors():
             return await self.pool.run(work, *arguments)
+
+    async def _with_whole_file(self, work: Callable[..., T], *arguments: object) -> T:
+        """As :meth:`on_disk`, for what takes long."""
+        with self._disk_errors():
+            return await self._storing.run(work, *arguments)
 
     @contextmanager
     def _disk_errors(self) -> Iterator[None]:

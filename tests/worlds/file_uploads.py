@@ -181,6 +181,7 @@ class FileWorld:
         self.uploads = Uploads(
             database=store,  # type: ignore[arg-type]
             pool=pool,  # type: ignore[arg-type]
+            storing=pool,  # type: ignore[arg-type]
             incoming=incoming,
             storage=storage,
             quotas=self.quotas,

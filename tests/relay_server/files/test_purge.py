@@ -28,7 +28,7 @@ class Service:
         pool: Any = StepPool(world.relay_steps)
         database: Any = world.store
         sessions: Any = None
-        core = FileCore(pool, world.incoming_folder, world.content, world.uploads, world.links)
+        core = FileCore(pool, pool, world.incoming_folder, world.content, world.uploads, world.links)
         self.world = world
         self.core = core
         self.service = FileService(sessions, core, database, EventBus(), 0, lambda: LATER)
@@ -172,7 +172,7 @@ def test_an_upload_that_goes_on_during_a_purge_stays(tmp_path: Path) -> None:
     world.start_relay(Steps())
     service = Service(world)
     pool: Any = SlowPool(world.relay_steps)
-    core = FileCore(pool, world.incoming_folder, world.content, world.uploads, world.links)
+    core = FileCore(pool, pool, world.incoming_folder, world.content, world.uploads, world.links)
     database: Any = world.store
     purging = FileService(service.service._sessions, core, database, EventBus(), 0, lambda: LATER)
     done: list[object] = []

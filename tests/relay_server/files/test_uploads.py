@@ -6,8 +6,10 @@ import hashlib
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
+from twisted.internet.defer import Deferred
 
 from relay_protocol.limits import KIB
 from relay_server.files import incoming
@@ -294,3 +296,31 @@ def test_contents_of_another_file_under_the_same_number_are_not_confirmed(tmp_pa
     after.run(15)
     assert not path.exists()
     after.check("b.log", b"B" * 1000)
+
+
+def test_files_that_are_being_stored_do_not_hold_up_the_parts_of_others(world: FileWorld) -> None:
+    """As with an S3-compatible storage that takes minutes."""
+
+    class Slow:
+        """Stores nothing until it may."""
+
+        def __init__(self) -> None:
+            self.held: list[Deferred[None]] = []
+
+        async def run(self, work: Any, *arguments: object) -> Any:
+            waiting: Deferred[None] = Deferred()
+            self.held.append(waiting)
+            await waiting
+            return work(*arguments)
+
+    slow = Slow()
+    world.uploads._storing = slow  # type: ignore[assignment]
+    for name in ("a.bag", "b.bag", "c.bag"):
+        world.write(name, bytes(3_000_000))
+        world.run(10)
+    assert len(slow.held) > 1
+    assert sum(each.received for each in world.uploads.of(world.robot_id)) == 3_000_000 * len(slow.held)
+    while slow.held:
+        slow.held.pop(0).callback(None)
+        world.run(10)
+    assert len(world.stored()) == 3

@@ -70,7 +70,7 @@ class Uploader:
         pool: Any = StepPool(world.relay_steps)
         database: Any = world.store
         sessions: Any = self.sessions
-        core = FileCore(pool, world.incoming_folder, world.content, world.uploads, world.links)
+        core = FileCore(pool, pool, world.incoming_folder, world.content, world.uploads, world.links)
         self.service = FileService(sessions, core, database, EventBus(), 0, lambda: OLD)
 
     def put(self, offset: int | None, stop: int = 0, sha256: str = SHA256, data: bytes = CONTENT) -> Any:
