@@ -93,7 +93,7 @@ class Scene:
     def listed(self, name: str) -> dict[str, Any] | None:
         """The file of this name, if the relay has it."""
         with suppress(URLError, OSError):
-            for each in json.loads(self.get(f"?limit=500"))["files"]:
+            for each in json.loads(self.get("?limit=500"))["files"]:
                 if each["name"] == f"bags/{name}":
                     return dict(each)
         return None
