@@ -137,7 +137,9 @@ def build_core(reactor: Any, settings: RelaySettings) -> Core:
             reactor,
             ControlAuditSink(bus, audit, time.time),
             DatabasePendingStops(
-                database, lambda robot_id: cluster is not None and not robots.connected(robot_id)
+                database,
+                lambda robot_id: cluster is not None and not robots.connected(robot_id),
+                "" if cluster is None else cluster.id,
             ),
             ControlRules.of(settings),
             robots.changed,

@@ -1,13 +1,11 @@
-"""Orders to many robots, for those whose home is another relay: each is sent there as an order to one robot.
-
-Stops are not sent this way. They are stored in the database, which the home reads at once.
-"""
+"""Orders to many robots, for those whose home is another relay: each is sent there as an order to one robot."""
 
 from __future__ import annotations
 
 from typing import Any, Protocol
 
 import msgspec
+from twisted.internet.defer import DeferredSemaphore
 
 from relay_db.queries import RobotRecord
 from relay_protocol import jsontext
@@ -19,6 +17,9 @@ from relay_server.cluster.relays import RelayInfo
 from relay_server.fleet.order import Order, TaskOutcome, body_of
 
 PATH = "/api/v1/fleet"
+
+AT_ONCE = 64
+"""Orders that are sent at a time."""
 
 
 class OrderForwarding(Protocol):
@@ -51,6 +52,7 @@ class ClusterOrders:
     def __init__(self, homes: RobotHomes, forwarder: Forwarder) -> None:
         self._homes = homes
         self._forwarder = forwarder
+        self._turns = DeferredSemaphore(AT_ONCE)
 
     async def send(
         self, principal: Principal, address: str, order: Order, robot: RobotRecord
@@ -60,7 +62,12 @@ class ClusterOrders:
         if relay is None:
             return None
         client = ForwardedClient.of(principal, address)
-        status, answer = await self._forwarder.ask("POST", PATH, body_of(order, robot.name), relay, client)
+        await self._turns.acquire()
+        try:
+            body = body_of(order, robot.name)
+            status, answer = await self._forwarder.ask("POST", PATH, body, relay, client)
+        finally:
+            self._turns.release()
         return outcome_of(status, answer, relay)
 
 

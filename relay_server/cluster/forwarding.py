@@ -164,6 +164,15 @@ class Forwarder:
         for each in list(self.websockets):
             each.close(close_codes.GOING_AWAY, reason)
 
+    def robot_moved(self, robot_id: int, relay: str) -> None:
+        """Close the websockets that are forwarded to the relay which a robot was connected to before.
+
+        :param relay: id of the one that it has connected to
+        """
+        for each in list(self.websockets):
+            if each.robot_id == robot_id and each.relay_id != relay:
+                each.close(close_codes.UNAVAILABLE, "the robot has connected to another relay; connect again")
+
     async def close(self) -> None:
         """Close idle connections."""
         await self._pool.closeCachedConnections()

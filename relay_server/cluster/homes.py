@@ -6,18 +6,21 @@ and websockets for the robot on to it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
+from weakref import WeakSet
 
 import msgspec
+from sqlalchemy.orm import Session
 from twisted.internet.defer import Deferred
 from twisted.internet.task import LoopingCall
 from twisted.logger import Logger
 
 from relay_db import queries
 from relay_db.queries import HomeRelayRecord
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.cluster.bus import ClusterBus
 from relay_server.cluster.relays import RelayDirectory, RelayInfo
 from relay_server.common.database import AsyncDatabase
@@ -43,11 +46,14 @@ class HomeNotice(msgspec.Struct, array_like=True, frozen=True):
 class RobotHomes(Protocol):
     """Where robots are connected. A single relay uses :class:`SingleHome`, a cluster :class:`ClusterHomes`."""
 
-    async def connecting(self, robot: RobotState, address: str) -> None:
+    async def connecting(
+        self, robot: RobotState, address: str, connected: Callable[[], bool] = lambda: True
+    ) -> None:
         """A robot has proved its identity here, and is registered next.
 
         :param address: its network address
-        :raises SwitchboardError: its home could not be recorded
+        :param connected: whether its connection is still open; may be called by any thread
+        :raises SwitchboardError: its home could not be recorded, or it has connected to another relay meanwhile
         """
 
     def disconnected(self, robot: RobotState) -> None:
@@ -63,7 +69,9 @@ class RobotHomes(Protocol):
 class SingleHome:
     """The only relay is the home of all robots (:class:`RobotHomes`)."""
 
-    async def connecting(self, robot: RobotState, address: str) -> None:
+    async def connecting(
+        self, robot: RobotState, address: str, connected: Callable[[], bool] = lambda: True
+    ) -> None:
         """Nothing is recorded."""
 
     def disconnected(self, robot: RobotState) -> None:
@@ -101,11 +109,16 @@ class ClusterHomes:
         self._relays = relays
         self._own = own
         self._homes: dict[int, HomeRelayRecord] = {}
-        self._connecting: set[int] = set()
+        self._connecting: Counter[int] = Counter()
+        """Robots that are about to be registered here, by the number of their connections."""
+        self._closed: WeakSet[ControlLinkPort] = WeakSet()
+        """Links that were closed because their robots have newer ones elsewhere."""
         self.on_moved: Callable[[RobotState], object] = lambda robot: None
         """Called with a robot that clients are connected to here, after it has connected to another relay."""
         self.on_key_used_twice: Callable[[RobotState, str, str], None] = lambda robot, newer, older: None
         """Called with both addresses if a link here answers after the key was proved at another relay."""
+        self.on_home: Callable[[int, str], object] = lambda robot_id, relay: None
+        """Called with the number of a robot that has connected to a relay, and the relay's id."""
         self._unsubscribe = _nothing
         self._loop = LoopingCall(self._update)
         self._loop.clock = reactor
@@ -127,13 +140,19 @@ class ClusterHomes:
 
     # --- robots of this relay -----------------------------------------------------------------------------
 
-    async def connecting(self, robot: RobotState, address: str) -> None:
+    async def connecting(
+        self, robot: RobotState, address: str, connected: Callable[[], bool] = lambda: True
+    ) -> None:
         """See :meth:`RobotHomes.connecting`."""
-        self._connecting.add(robot.robot_id)
+        self._connecting[robot.robot_id] += 1
         try:
-            epoch = await self._database.write(queries.claim_home_relay, robot.robot_id, self._own)
+            epoch = await self._database.write(_claim, robot.robot_id, self._own, connected)
         finally:
-            self._connecting.discard(robot.robot_id)
+            self._connecting[robot.robot_id] -= 1
+            self._connecting += Counter()
+        known = self._homes.get(robot.robot_id)
+        if known is not None and known.epoch > epoch:
+            raise Unavailable("the robot has connected to another relay meanwhile")
         self._announce(HomeNotice(robot.robot_id, self._own, epoch, address))
 
     def disconnected(self, robot: RobotState) -> None:
@@ -201,13 +220,24 @@ class ClusterHomes:
         :param address: of the robot; empty: not known
         """
         known = self._homes.get(home.robot_id)
-        if known is not None and (known.epoch, known.relay == "") >= (home.epoch, home.relay == ""):
-            return
-        self._homes[home.robot_id] = home
+        new = known is None or (known.epoch, known.relay == "") < (home.epoch, home.relay == "")
+        if new:
+            self._homes[home.robot_id] = home
+        # A link that was registered here after the notice came is found by the next read.
+        self._close_older(self._homes[home.robot_id], address)
+        if new:
+            self._update_elsewhere(home.robot_id)
+        if new and home.relay:
+            self.on_home(home.robot_id, home.relay)
+
+    def _close_older(self, home: HomeRelayRecord, address: str) -> None:
+        """Close a robot's link here if the robot has a newer one at another relay."""
         robot = self._robots.find(home.robot_id)
-        if home.relay not in ("", self._own) and robot is not None and robot.control_link is not None:
-            self._close_link(robot, robot.control_link, home.relay, address)
-        self._update_elsewhere(home.robot_id)
+        link = None if robot is None else robot.control_link
+        if robot is None or link is None or home.relay in ("", self._own) or link in self._closed:
+            return
+        self._closed.add(link)
+        self._close_link(robot, link, home.relay, address)
 
     def _close_link(self, robot: RobotState, older: ControlLinkPort, relay: str, address: str) -> None:
         """Close a robot's link here, because the robot has connected to another relay."""
@@ -224,12 +254,25 @@ class ClusterHomes:
             if home.relay == self._own and not self._is_here(home.robot_id):
                 # It was not released while the database did not answer.
                 self._release(home)
-            else:
-                self._apply(home)
+                continue
+            self._apply(home)
+            if home.relay == "" and self._is_registered(home.robot_id):
+                # A connection to another relay was given up after that had been recorded, so this one counts.
+                await self._claim_again(home)
+
+    async def _claim_again(self, home: HomeRelayRecord) -> None:
+        """Record that a robot is connected here, unless it has connected to another relay since that was read."""
+        epoch = await self._database.write(queries.reclaim_home_relay, home.robot_id, self._own, home.epoch)
+        if epoch is not None and self._is_registered(home.robot_id):
+            self._announce(HomeNotice(home.robot_id, self._own, epoch))
+
+    def _is_registered(self, robot_id: int) -> bool:
+        robot = self._robots.find(robot_id)
+        return robot is not None and robot.control_link is not None and robot.control_link not in self._closed
 
     def _is_here(self, robot_id: int) -> bool:
         robot = self._robots.find(robot_id)
-        return robot_id in self._connecting or (robot is not None and robot.control_link is not None)
+        return bool(self._connecting[robot_id]) or (robot is not None and robot.control_link is not None)
 
     def _update(self) -> Deferred[None]:
         return Deferred.fromCoroutine(self._read()).addErrback(self._not_read)
@@ -237,6 +280,13 @@ class ClusterHomes:
     def _not_read(self, failure: Any) -> None:
         if not failure.check(SwitchboardError):
             self.log.failure("reading the homes of robots failed", failure)
+
+
+def _claim(s: Session, robot_id: int, relay: str, connected: Callable[[], bool]) -> int:
+    """:raises Unavailable: the robot has gone while the database was busy; its connection elsewhere must count"""
+    if not connected():
+        raise Unavailable("the robot has disconnected")
+    return queries.claim_home_relay(s, robot_id, relay)
 
 
 def _nothing() -> None:

@@ -60,6 +60,7 @@ class Cluster:
         self.bus = NatsBus(reactor, settings.bus, replicas)
         self.relays = RelayDirectory(reactor, self.bus, self._own)
         self.homes = ClusterHomes(reactor, database, robots, self.bus, self.relays, self.id)
+        self.homes.on_home = lambda robot_id, relay: self.forwarder.robot_moved(robot_id, relay)
         self.relays.on_change = self._relays_changed
         self.leadership = Leadership(reactor, database, self.id)
         self.take_over: Callable[[Collection[str]], Awaitable[None]] = lambda live: succeed(None)

@@ -108,11 +108,14 @@ class ForwardedWebSocket:
         clock: Clock,
         forwarder: Forwarder,
         relay: RelayInfo,
+        robot_id: int,
         handshake: ForwardedHandshake,
         client: ForwardedClient,
         transport: ForwardedTransport,
         earliest_sent: int,
     ) -> None:
+        self.robot_id = robot_id
+        self.relay_id = relay.id
         self.send_queue = SendQueue(transport.send, clock.seconds, _nothing)
         self.earliest_sent = earliest_sent
         self._clock = clock

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from twisted.logger import Logger
 
 from relay_db import queries
-from relay_db.queries import StopRecord
+from relay_db.queries import RobotMoved, StopRecord
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.common.clock import Clock, sleep
 from relay_server.common.concurrency import detached
@@ -67,20 +67,27 @@ class DatabasePendingStops:
     """The table of stops that robots have not confirmed.
 
     :param announce: whether a robot may be connected to another relay of the cluster, which then must find its stop
+    :param relay: id of this relay in its cluster; empty: it is the only one
     """
 
     def __init__(
-        self, store: AsyncDatabase, announce: Callable[[int], bool] = lambda robot_id: False
+        self, store: AsyncDatabase, announce: Callable[[int], bool] = lambda robot_id: False, relay: str = ""
     ) -> None:
         self._store = store
         self._announce = announce
+        self._relay = relay
 
     async def save_stop(self, stop: StopRecord) -> None:
         """See :class:`PendingStops`."""
-        announce = self._announce(stop.robot_id)
-        await self._store.write(
-            queries.store_stop, stop.robot_id, stop.by, stop.why, stop.at, stop.stop_id, announce=announce
-        )
+        row = stop.robot_id, stop.by, stop.why, stop.at, stop.stop_id
+        if not self._announce(stop.robot_id):
+            try:
+                await self._store.write(queries.store_stop, *row, home=self._relay)
+                return
+            except RobotMoved:
+                # It is connecting to another relay, and its link here is about to end.
+                pass
+        await self._store.write(queries.store_stop, *row, announce=True)
 
     async def delete_stop(
         self, robot: RobotState, at: float | None = None, *, announce: bool = False

@@ -69,6 +69,9 @@ STOP_OR_RESUME_SECONDS = 19.0
 """Time for a stop and a resume, whatever the order says: longer than the control service takes for them, even if the
 database is asked first."""
 
+ELSEWHERE_SECONDS = 5.0
+"""Seconds in which another relay must answer an order to stop. After that the order is stored in the database too."""
+
 LOCAL = Principal(0, "admin (local)", DEFAULT_REALM, True, 0, None)
 """Stands for any client of the relay's local socket. No user can have this name, since it contains a space."""
 
@@ -246,11 +249,13 @@ class FleetService:
     def _stop_online(
         self, principal: Principal, order: Order, address: str
     ) -> dict[str, tuple[RobotRecord, Deferred[TaskResult]]]:
-        """Stop the robots that match by name or pattern, are online, and are known to be the user's."""
+        """Stop the robots that match by name or pattern, are online, also at another relay, and are known to be the
+        user's.
+        """
         here = {
             each.name: RobotRecord(each.robot_id, each.name, each.realm, "")
             for each in self._registry
-            if each.control_link is not None and self._may_stop_at_once(principal, each)
+            if (each.control_link is not None or each.elsewhere) and self._may_stop_at_once(principal, each)
         }
         robots = {name: here[name] for name in select_robots(order.robots, here, {}).robots}
         plan = FleetPlan(order, principal, address, robots, [])
@@ -349,17 +354,32 @@ class FleetService:
 
     async def _dispatch(self, plan: FleetPlan, robot: RobotRecord) -> TaskOutcome:
         order = plan.order
-        if order.do != "stop" and not plan.forwarded:
-            outcome = await self._forwarding.send(plan.principal, plan.address, order, robot)
-            if outcome is not None:
-                return outcome
         if order.do == "stop" and self._fleet_stop.online(robot):
             return await self._fleet_stop.stop(
                 robot, plan.actor(self._state_of(robot)), order.why, order.stop_id
             )
+        if not plan.forwarded:
+            outcome = await self._at_home(plan, robot)
+            if outcome is not None:
+                return outcome
         if order.do in ("stop", "resume"):
             return await self._stop_or_resume(plan, robot)
         return await self._run_task(plan, robot)
+
+    async def _at_home(self, plan: FleetPlan, robot: RobotRecord) -> TaskOutcome | None:
+        """The outcome at the relay that the robot is connected to.
+
+        :returns: ``None``: it is connected to no other relay, or that does not answer an order to stop
+        """
+        sending = self._forwarding.send(plan.principal, plan.address, plan.order, robot)
+        if plan.order.do != "stop":
+            return await sending
+        try:
+            late = "the relay that the robot is connected to does not answer"
+            return await with_timeout(self._clock, ELSEWHERE_SECONDS, sending, late)
+        except Unavailable as error:
+            self.log.warn("a stop of {robot} is stored: {reason}", robot=robot.full, reason=str(error))
+            return None
 
     async def _stop_or_resume(self, plan: FleetPlan, record: RobotRecord) -> TaskOutcome:
         """Stop a robot or let it move again, by the user's rights when its turn comes."""

@@ -47,6 +47,9 @@ MAX_ERRORS = 50
 MAX_RUNNING = 32
 """Requests of one program that are in progress, and requests to it."""
 
+STOPS_RUNNING = 8
+"""More that stop something."""
+
 REPLY_SECONDS = 10.0
 """Time limit of a program's reply."""
 
@@ -82,6 +85,8 @@ class IcpiServices:
         self.clock_ns = clock_ns
         self.timers = PeriodicTimers(clock)
         self.messages = Buckets(MESSAGES_PER_SECOND, MESSAGES_BURST, MAX_USERS, clock.seconds)
+        self.stops = Buckets(MESSAGES_PER_SECOND, MESSAGES_BURST, MAX_USERS, clock.seconds)
+        """Requests to stop are counted apart, so that other messages keep none from being carried out."""
 
 
 class IcpiSession:
@@ -142,15 +147,16 @@ class IcpiSession:
             message = parse(text)
             is_reply = message.function == REPLY
             # A reply that is waited for does not count: the relay has asked for it.
+            is_stop = message.function == "stop"
             if not (is_reply and message.id in self._waiting):
-                self._count()
+                self._count(self._services.stops if is_stop else self._services.messages)
         except SwitchboardError as error:
             self._refuse(id_of(text), error)
             return
         if is_reply:
             self._replied(message)
             return
-        if self._running >= MAX_RUNNING:
+        if self._running >= MAX_RUNNING + (STOPS_RUNNING if is_stop else 0):
             self._reply(message, "error", f"{MAX_RUNNING} requests of yours are in progress; wait for one")
             return
         self._running += 1
@@ -200,9 +206,9 @@ class IcpiSession:
             each.errback(Unavailable(f"program {self._name} has disconnected"))
         self._ended(self)
 
-    def _count(self) -> None:
+    def _count(self, messages: Buckets) -> None:
         """:raises Unavailable: the user's programs send too much"""
-        if not self._services.messages.take(self._user):
+        if not messages.take(self._user):
             raise Unavailable(
                 f"your programs send more than {MESSAGES_PER_SECOND:g} messages a second; this one was dropped"
             )
@@ -213,6 +219,8 @@ class IcpiSession:
         try:
             principal = await self._services.authenticate(self._token)
             principal.require_full_scope()
+            if self._closed:
+                raise Unavailable("the program has disconnected")
             value = await self._carry_out(message, RoleUser(principal, self._address, sent))
             if message.acknowledge:
                 self._reply(message, "ok", value)

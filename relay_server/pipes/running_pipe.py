@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 from twisted.internet.defer import Deferred
+from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_db.queries import PipeRecord
@@ -118,6 +119,8 @@ class RunningPipe:
     :ivar problem: why the latest message was not carried
     :ivar encoded: messages that were carried without decoding
     """
+
+    log = Logger()
 
     def __init__(
         self,
@@ -558,8 +561,16 @@ class RunningPipe:
         except SwitchboardError as error:
             self.failed(error)
             return
+        except Exception:
+            self._broken()
+            return
         if self._caller is None and sent:
             self._count(arrived)
+
+    def _broken(self) -> None:
+        """An error of the relay itself ends this pipe, and nothing else: not the source's data for others."""
+        self.log.failure("pipe {name} failed on a message", name=self.record.name)
+        self.end("the relay failed on a message; see its log")
 
     def receive_reply(self, reply: PipeReply) -> None:
         """Carry one answer of the service, action or function that is the source, or a value of the port."""
@@ -573,6 +584,9 @@ class RunningPipe:
             sent = self._convert_and_send(reply.body, arrived, reply.earliest_sent)
         except SwitchboardError as error:
             self.failed(error)
+            return
+        except Exception:
+            self._broken()
             return
         if self._caller is None and sent:
             self._count(arrived)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import msgspec
@@ -626,10 +627,18 @@ def _edge(record: PipeRecord, *, shown: bool = True) -> PipeEdge:
     )
 
 
+def _check_targets(targets: list[str]) -> None:
+    """:raises Invalid: two mappings write the same field, or one writes into what the other has written"""
+    for first, second in pairwise(sorted(targets, key=lambda each: each.split("."))):
+        if second == first or second.startswith(f"{first}."):
+            raise Invalid(f"two mappings write '{first}': '{first}' and '{second}'")
+
+
 def _check_settings(new: NewPipe) -> None:
     """:raises Invalid: they can't be used, whatever the robots have"""
     for mapping in new.fields:
         steps_of(mapping.source)
+    _check_targets([mapping.target for mapping in new.fields])
     for end in (new.source, new.target):
         if end.service:
             check_service(end.service)

@@ -22,7 +22,7 @@ from relay_db import queries
 from relay_db.names import normalise
 from relay_db.queries import RobotRecord
 from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
-from relay_protocol.errors import Invalid, MalformedMessage, Refused, Unavailable
+from relay_protocol.errors import Invalid, MalformedMessage, Refused, SwitchboardError, Unavailable
 from relay_protocol.frames import SAMPLE_HEAD, SampleFrame, VideoFrame, VideoFrameJoiner, VideoFramePart
 from relay_protocol.function_link import FUNCTION_FRAME
 from relay_protocol.limits import KIB
@@ -163,18 +163,28 @@ class HandshakeHandler(LinkHandler):
             self._begin_functions(record, hello.key)
             return
         robot = context.robots.robot(record.robot_id, record.robot, record.realm)
-        await context.controllers.robot_connecting(robot)
-        await context.homes.connecting(robot, connection.address)
+        await context.homes.connecting(robot, connection.address, lambda: not connection.ended)
+        # After that: a stop which another relay has stored before it knew of this one is found now, and one that it
+        # stores later is announced.
+        try:
+            await context.controllers.robot_connecting(robot)
+        except SwitchboardError:
+            self._not_registered(robot)
+            raise
         if connection.ended:
             # It closed while the database was asked. Registering it now would leave a robot without a link.
-            if robot.control_link is None:
-                context.homes.disconnected(robot)
+            self._not_registered(robot)
             return
         ControlLinkHandler(context, connection, robot, hello).begin()
         # The key may have been revoked since it was read, before this robot was there to be disconnected.
         again = await _key_of(context, hello)
         if again is None or again.robot_id != record.robot_id:
             connection.close("the robot's key is not accepted any more")
+
+    def _not_registered(self, robot: RobotState) -> None:
+        """This relay was recorded as the robot's home, and is not."""
+        if robot.control_link is None:
+            self._context.homes.disconnected(robot)
 
     def _begin_functions(self, record: queries.RobotKeyRecord, key: str) -> None:
         connection = self._connection

@@ -7,7 +7,7 @@ then the pipe runs while these are started, too.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import msgspec
@@ -30,7 +30,7 @@ class RolePart(msgspec.Struct):
     :param resource: as the document has it, or the pipe of a mapping
     :param mapped: whether the pipe was made for a mapping, so that it is removed with the Role's end
     :param new: of a mapping, the pipe as JSON
-    :param needs: of a mapping, other Roles that have one of its elements
+    :param needs: of a mapping, for each end in other Roles the Roles that have it; one of them must be started
     :param waits: whether it is not started, as one of these is not
     :param error: why it was not started, or not stopped
     :param still_runs: whether it could not be stopped, but a second stop may succeed
@@ -40,7 +40,7 @@ class RolePart(msgspec.Struct):
     resource: str
     mapped: bool = False
     new: str = ""
-    needs: list[str] = []
+    needs: list[list[str]] = []
     waits: bool = False
     error: str = ""
     still_runs: bool = False
@@ -51,6 +51,11 @@ class RolePart(msgspec.Struct):
         found = binding_of(self.resource)
         assert found is not None
         return found
+
+    def waits_for(self, started: Collection[str]) -> str:
+        """The Roles that must be started before it, in words; empty: none."""
+        missing = [each for each in self.needs if not any(role in started for role in each)]
+        return " and ".join(" or ".join(each) for each in missing)
 
     @property
     def robots(self) -> list[str]:
@@ -154,10 +159,16 @@ def _mappings(
 
 
 def _pipe_part(name: str, mapped: list[_Mapped]) -> RolePart:
-    element = ", ".join(each.element for each in mapped)
-    needs = {end.role for each in mapped for end in (each.source, each.target) if end.role}
-    part = RolePart(element, f"pipes/{name}", mapped=True, needs=sorted(needs))
-    bindings = [(each.source.binding, each.target.binding) for each in mapped]
+    # Several Roles may have the same resource; then it is carried once.
+    roles: dict[tuple[str, Binding, Binding], tuple[set[str], set[str]]] = {}
+    for each in mapped:
+        found = roles.setdefault((each.element, each.source.binding, each.target.binding), (set(), set()))
+        found[0].add(each.source.role)
+        found[1].add(each.target.role)
+    needs = {tuple(sorted(end)) for ends in roles.values() for end in ends if "" not in end}
+    element = ", ".join(dict.fromkeys(each for each, _, _ in roles))
+    part = RolePart(element, f"pipes/{name}", mapped=True, needs=[list(each) for each in sorted(needs)])
+    bindings = [(source, target) for _, source, target in roles]
     source, target = bindings[0]
     whole = [not (a.pointer or b.pointer) for a, b in bindings]
     paths = [[_path(end) for end in pair] for pair in bindings]

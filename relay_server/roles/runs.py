@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
 
 import msgspec
@@ -15,10 +15,12 @@ from twisted.logger import Logger
 from relay_db import queries
 from relay_db.queries import RoleRunRecord
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.realms import full_name
 from relay_protocol.rights import Operation
 from relay_server.access import Principal
 from relay_server.cluster.relays import RelayInfo
 from relay_server.common.clock import Clock, PeriodicTimer, PeriodicTimers
+from relay_server.common.concurrency import shield
 from relay_server.common.database import AsyncDatabase
 from relay_server.events.bus import EventBus
 from relay_server.icpi.programs import ProgramRegistry
@@ -94,6 +96,8 @@ class RoleRuns:
         self._timers = PeriodicTimers(clock)
         self._watches: dict[int, _Watch] = {}
         self._unwatched: dict[int, RoleRunRecord] = {}
+        self._incomplete = False
+        """Whether Roles may be started that are in neither of these."""
         self._changing: WeakValueDictionary[tuple[str, str], DeferredLock] = WeakValueDictionary()
         self._followers: list[Callable[[], None]] = []
         self._timer_list = [
@@ -135,29 +139,55 @@ class RoleRuns:
         if missing:
             raise Invalid(f"the Role {role} can't be started: {'; '.join(missing)}")
         others = await self._roles.resources_elsewhere(principal, role, unbound(elements))
-        async with self._lock(principal.realm, role):
-            started = await self._start(user, role, lambda number: plan_of(number, elements, others))
-        await self._join(principal.realm, role, principal.user_id)
-        return started
+
+        async def work() -> RoleRunState:
+            async with self._lock(principal.realm, role):
+                started = await self._start(user, role, lambda number: plan_of(number, elements, others))
+            await self._join(principal.realm, role, principal.user_id)
+            return started
+
+        # To its end, also when the client has left.
+        return await shield(Deferred.fromCoroutine(work()))
 
     async def _start(self, user: RoleUser, role: str, plan: Callable[[int], list[RolePart]]) -> RoleRunState:
         principal = user.principal
+        up = await self._up(principal, role)
         role_id, parts, before = await self._database.write(self._begin, user, role, plan)
+        # Until the end of this, and if the database fails meanwhile, the Role is watched by what is stored.
         self._unwatch(role_id)
+        self._incomplete = True
         if before is not None:
             parts += await self._stop_others(before, user, parts)
         started = await self._started(principal.realm)
         for part in parts:
-            part.waits = not started.issuperset(part.needs)
-            if not part.error and not part.waits:
+            part.waits = bool(part.waits_for(started))
+            if not part.error and not part.waits and (part.resource, part.new) not in up:
                 part.error = await self._carry_out(user, role, part, start=True)
         await self._database.write(queries.set_role_parts, role_id, _encoded(parts))
         run = await self._find(principal.realm, role)
         if run is not None:
             self._unwatched[role_id] = run
-            await self._watch(run)
+            await self._watch(run, locked=True)
             self._publish("role.started", run, self._admissions(role_id))
         return await self.state(principal, role)
+
+    async def _up(self, principal: Principal, role: str) -> set[tuple[str, str]]:
+        """What a started Role of the user has running already, and need not be started again.
+
+        Programs are asked again: one that has connected again since does not know that it was started.
+        """
+        run = await self._find(principal.realm, role)
+        if run is None or run.reason or run.user.id != principal.user_id:
+            return set()
+        states = await self._part_states(run)
+        return {
+            (part.resource, part.new)
+            for part, now in zip(_decoded(run), states, strict=True)
+            if not part.error
+            and not part.waits
+            and part.binding.kind != "programs"
+            and now.state in _UP | _COMING
+        }
 
     async def _stop_others(
         self, before: RoleRunRecord, user: RoleUser, parts: list[RolePart]
@@ -178,10 +208,14 @@ class RoleRuns:
         principal = user.principal
         principal.require_full_scope()
         info = await self._roles.role(principal, role)
-        async with self._lock(principal.realm, role):
-            stopped = await self._stop(user, role, info)
-        await self._join(principal.realm, role, principal.user_id)
-        return stopped
+
+        async def work() -> RoleRunState:
+            async with self._lock(principal.realm, role):
+                stopped = await self._stop(user, role, info)
+            await self._join(principal.realm, role, principal.user_id)
+            return stopped
+
+        return await shield(Deferred.fromCoroutine(work()))
 
     async def _stop(self, user: RoleUser, role: str, info: RoleInfo) -> RoleRunState:
         principal = user.principal
@@ -212,7 +246,7 @@ class RoleRuns:
         :param by: number of the user; a pipe of another user does not begin to move a robot by this
         """
         for run in await self._database.read(queries.list_role_runs, realm):
-            if any(changed in each.needs for each in _decoded(run)):
+            if any(changed in roles for part in _decoded(run) for roles in part.needs):
                 async with self._lock(realm, run.role):
                     await self._join_one(realm, run.role, changed, by)
 
@@ -223,8 +257,8 @@ class RoleRuns:
         started, parts = await self._started(realm), _decoded(run)
         owner = RoleUser(Principal.of_user(run.user), "")
         for part in parts:
-            waits = not started.issuperset(part.needs)
-            if changed in part.needs and waits != part.waits:
+            waits = bool(part.waits_for(started))
+            if any(changed in each for each in part.needs) and waits != part.waits:
                 part.waits = waits
                 fresh = run.user.id == by
                 part.error = await self._carry_out(owner, role, part, start=not waits, fresh=fresh)
@@ -305,30 +339,37 @@ class RoleRuns:
     async def _part_states(self, run: RoleRunRecord) -> list[RolePartState]:
         owner = Principal.of_user(run.user)
         pipes = {each.name: each for each in (await self._pipes.pipes(pipe_user(owner, ""))).pipes}
-        robots = {each.robot.name: each for each in self._admissions(run.role_id)}
+        robots = {each.robot.full: each for each in self._admissions(run.role_id)}
+        started = await self._started(run.realm)
         states = []
         for part in _decoded(run):
-            state, why = self._part_state(part, run.user.id, pipes, robots)
+            if part.waits and not part.error:
+                why = f"waiting for {part.waits_for(started) or 'its Roles'} to be started"
+                states.append(RolePartState(part.element, part.resource, "waiting", why))
+                continue
+            state, why = self._part_state(part, run, pipes, robots)
             if state == ELSEWHERE:
                 state, why = await self._module_elsewhere(owner, run, part)
             states.append(RolePartState(part.element, part.resource, state, why))
         return states
 
     def _part_state(
-        self, part: RolePart, user_id: int, pipes: dict[str, PipeStatus], robots: dict[str, Admission]
+        self,
+        part: RolePart,
+        run: RoleRunRecord,
+        pipes: dict[str, PipeStatus],
+        robots: dict[str, Admission],
     ) -> tuple[str, str]:
         binding = part.binding
         if part.error:
             return "failed", part.error
-        if part.waits:
-            return "waiting", f"waiting for {' and '.join(part.needs)} to be started"
         if binding.kind == "pipes":
             pipe = pipes.get(binding.name)
             return ("failed", "the pipe was removed") if pipe is None else (pipe.state, pipe.why)
         if binding.kind == "programs":
-            known = any(each.name == binding.name for each in self._programs.of(user_id))
+            known = any(each.name == binding.name for each in self._programs.of(run.user.id))
             return ("on", "") if known else ("waiting", f"waiting for program {binding.name} to connect")
-        admission = robots.get(binding.robot)
+        admission = robots.get(_full(binding.robot, run.realm))
         if admission is None:
             return "waiting", "waiting for the relay to check the rights"
         if admission.robot.elsewhere:
@@ -359,18 +400,22 @@ class RoleRuns:
         watch = self._watches.get(role_id)
         return [] if watch is None else watch.admissions
 
-    async def _watch(self, run: RoleRunRecord) -> None:
-        """Hold permits of the user on all robots of the Role, so that it ends when one is revoked."""
-        principal = Principal.of_user(run.user)
+    async def _watch(self, run: RoleRunRecord, *, locked: bool = False) -> None:
+        """Hold permits of the user on all robots of the Role, so that it ends when one is revoked.
+
+        :param locked: whether the caller keeps others from changing the Role
+        """
         admissions: list[Admission] = []
         try:
-            for robot in dict.fromkeys(robot for each in _decoded(run) for robot in each.robots):
-                admissions.append(await self._sessions.admit(principal, robot, f"role {run.role}"))
+            for robot in dict.fromkeys(
+                robot for each in _decoded(run) if not each.error for robot in each.robots
+            ):
+                admissions.append(await self._admit(run, robot))
         except SwitchboardError as error:
             for each in admissions:
                 self._sessions.release(each)
             if not isinstance(error, Unavailable):
-                await self._end(run, str(error))
+                await (self._end_alone if locked else self._end)(run, str(error))
             return
         if self._unwatched.pop(run.role_id, None) is None:
             for each in admissions:
@@ -382,13 +427,26 @@ class RoleRuns:
             each.permit.on_change = partial(self._check, run)
         self._check(run)
 
+    async def _admit(self, run: RoleRunRecord, robot: str) -> Admission:
+        """A permit of the user on a robot, for one in another realm by their account there.
+
+        :raises SwitchboardError: there is no right, or no account; the database does not answer
+        """
+        user = run.user
+        name, at, realm = robot.partition("@")
+        if at and realm != run.realm:
+            accounts = await self._database.read(queries.pipe_accounts, user.id, (realm, realm))
+            user = accounts[0]
+        return await self._sessions.admit(Principal.of_user(user), name, f"role {run.role}")
+
     def _check(self, run: RoleRunRecord) -> None:
         """End the Role if its user may no longer manage one of its modules."""
-        permits = {each.robot.name: each.permit for each in self._admissions(run.role_id)}
+        permits = {each.robot.full: each.permit for each in self._admissions(run.role_id)}
         for part in _decoded(run):
             binding = part.binding
-            if binding.kind == "modules" and not part.error and binding.robot in permits:
-                decision = permits[binding.robot].decide(Operation.MANAGE, binding.name)
+            robot = _full(binding.robot, run.realm)
+            if binding.kind == "modules" and not part.error and robot in permits:
+                decision = permits[robot].decide(Operation.MANAGE, binding.name)
                 if not decision.allowed:
                     self._revoked(run, Refused(decision.reason))
                     return
@@ -398,7 +456,16 @@ class RoleRuns:
         work.addErrback(lambda failure: self.log.failure("the end of a Role could not be stored", failure))
 
     async def _end(self, run: RoleRunRecord, reason: str) -> None:
-        """End a Role whose user lost a right. Its pipes end; modules are left, as the right to stop them is gone."""
+        """End a Role whose user lost a right, unless it was stopped or started again meanwhile."""
+        async with self._lock(run.realm, run.role):
+            now = await self._find(run.realm, run.role)
+            if now is None or now.reason or (now.at, now.user.id) != (run.at, run.user.id):
+                return
+            await self._end_alone(now, reason)
+        await self._join(run.realm, run.role, run.user.id)
+
+    async def _end_alone(self, run: RoleRunRecord, reason: str) -> None:
+        """Its pipes end; modules are left, as the right to stop them is gone."""
         admissions = self._unwatch(run.role_id)
         self.log.info("Role {name} has ended: {reason}", name=run.role, reason=reason)
         owner = RoleUser(Principal.of_user(run.user), "")
@@ -407,7 +474,6 @@ class RoleRuns:
                 await self._carry_out(owner, run.role, part, start=False)
         if await self._database.write(self._note_end, run, reason):
             self._publish("role.ended", run, admissions)
-            await self._join(run.realm, run.role, run.user.id)
 
     def _unwatch(self, role_id: int) -> list[Admission]:
         admissions = self._admissions(role_id)
@@ -419,9 +485,35 @@ class RoleRuns:
         return admissions
 
     def _watch_all(self) -> None:
+        work = Deferred.fromCoroutine(self._watch_unwatched())
+        work.addErrback(self._not_watched)
+
+    async def _watch_unwatched(self) -> None:
+        if self._incomplete:
+            self._incomplete = False
+            try:
+                runs = await self._database.read(queries.list_role_runs)
+            except BaseException:
+                self._incomplete = True
+                raise
+            for run in runs:
+                if not run.reason and run.role_id not in self._watches and not self._is_changing(run):
+                    self._unwatched.setdefault(run.role_id, run)
         for run in list(self._unwatched.values()):
-            work = Deferred.fromCoroutine(self._watch(run))
-            work.addErrback(lambda failure: self.log.failure("a Role could not be watched", failure))
+            if not self._is_changing(run):
+                await self._watch(run)
+
+    def _is_changing(self, run: RoleRunRecord) -> bool:
+        """Whether a start or stop is under way. It has the Role watched itself."""
+        lock = self._changing.get((run.realm, run.role))
+        if lock is None or not lock.locked:
+            return False
+        self._incomplete = True
+        return True
+
+    def _not_watched(self, failure: Any) -> None:
+        if not failure.check(Unavailable):
+            self.log.failure("a Role could not be watched", failure)
 
     def _tick(self) -> None:
         for listener in list(self._followers):
@@ -489,6 +581,12 @@ class RoleRuns:
         for each in admissions:
             source = f"user:{each.robot.name_of(run.user.name, run.realm)}"
             self._bus.publish(kind, each.robot.robot_id, source, role=run.role)
+
+
+def _full(robot: str, realm: str) -> str:
+    """The full name of a robot by the name that users of a realm have for it."""
+    name, at, other = robot.partition("@")
+    return full_name(name, other if at else realm)
 
 
 def _ignore(*_: object) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import msgspec
 from sqlalchemy.orm import Session
 from twisted.internet.defer import Deferred, DeferredLock
 
@@ -21,6 +22,7 @@ from relay_server.common.etags import PreconditionFailed, check_match, tag_of
 from relay_server.common.token_bucket import Buckets
 from relay_server.roles.bindings import Binding, binding_of
 from relay_server.roles.documents import FORMATS, LoadedRole
+from relay_server.roles.plan import RolePart
 from relay_server.roles.process import RoleProcess
 from relay_server.roles.schemas import RoleElement, RoleInfo, StoredRole
 from relay_server.roles.vocabulary import FIERRO, canonical
@@ -461,9 +463,14 @@ def iri_of(element: str) -> str:
 
 
 def check_not_started(s: Session, realm: str, name: str) -> None:
-    """:raises RoleStarted: the Role is started, so it can't be removed"""
-    if any(not each.reason for each in queries.list_role_runs(s, realm, name)):
-        raise RoleStarted(f"the Role {name} is started; stop it before you remove it")
+    """:raises RoleStarted: the Role is started, or parts of it could not be stopped, so it can't be removed"""
+    for run in queries.list_role_runs(s, realm, name):
+        if not run.reason:
+            raise RoleStarted(f"the Role {name} is started; stop it before you remove it")
+        if any(each.still_runs for each in msgspec.json.decode(run.parts, type=list[RolePart])):
+            raise RoleStarted(
+                f"parts of the Role {name} could not be stopped; stop it again before you remove it"
+            )
 
 
 def old_match(match: str | None) -> str:

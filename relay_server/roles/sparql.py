@@ -199,19 +199,24 @@ class RoleGraphs:
 
         :param elements: their IRIs
         :param names: of the Roles that may be used; ``None`` for all
+        :raises Invalid: one has too many
         """
         graphs = None if names is None else {graph_of(each) for each in names}
         resource = NamedNode(f"{SWITCHBOARD}resource")
-        quads: Any = (
-            each
-            for element in elements
-            for each in self._store.quads_for_pattern(NamedNode(_checked_iri(element)), resource, None)
-        )
-        return [
-            (each.subject.value, local_name(each.graph_name), each.object.value)
-            for each in islice(quads, MAX_BINDINGS)
-            if graphs is None or each.graph_name in graphs
-        ]
+        found: list[tuple[str, str, str]] = []
+        for element in elements:
+            quads: Any = self._store.quads_for_pattern(NamedNode(_checked_iri(element)), resource, None)
+            visible = (each for each in quads if graphs is None or each.graph_name in graphs)
+            own = [
+                (element, local_name(each.graph_name), each.object.value)
+                for each in islice(visible, MAX_BINDINGS + 1)
+            ]
+            if len(own) > MAX_BINDINGS:
+                raise Invalid(
+                    f"{element} has more than {MAX_BINDINGS} resources in all Roles; map another element"
+                )
+            found += own
+        return found
 
     def missing(self, name: str) -> list[str]:
         """Sentences about what a Role lacks to be started."""

@@ -151,7 +151,8 @@ def _takes(own: list[Binding], others: list[Binding], command: Command, robots: 
     robot = robots.get(binding.robot)
     if robot is None:
         return False
-    step, name = (binding.kind, command), f"/{binding.name.lstrip('/')}"
+    step = binding.kind, command
+    name = binding.name if binding.kind == "modules" else f"/{binding.name.lstrip('/')}"
     if step in _NEEDED and not robot.rules.decide(_NEEDED[step], name).allowed:
         return False
     return step not in _SWITCHES or not _SWITCHES[step].isdisjoint(_types(robot.graph, binding.kind, name))

@@ -368,6 +368,7 @@ class ClientConnection(BoundedProtocol):
             self.factory.clock,
             forwarding.forwarder,
             relay,
+            self._admission.robot.robot_id,
             handshake,
             client,
             self,

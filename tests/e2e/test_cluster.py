@@ -267,7 +267,7 @@ def test_cameras_at_another_relay_are_shown(fleet: Fleet) -> None:
 
 
 def test_an_order_to_many_robots_reaches_those_of_other_relays(fleet: Fleet) -> None:
-    """The robot's relay refuses an order that needs its age; a stop is passed on by the database."""
+    """The robot's relay refuses an order that needs its age; a stop is sent to it, and confirmed by the robot."""
     url = f"http://127.0.0.1:{fleet.second.http_port}/api/v1/fleet"
     headers = {"Authorization": f"Bearer {fleet.token}"}
     results = []
@@ -278,13 +278,21 @@ def test_an_order_to_many_robots_reaches_those_of_other_relays(fleet: Fleet) -> 
         ]
     assert [(each["robot"], each["ok"]) for each in results] == [("rover", True), ("rover", False)]
     assert results[0]["values"] == {"success": True, "message": "hello"}
-    fleet.second.run_cli("stop", "rover")
-    wait_for("it is stopped", lambda: fleet.robot.stopped is not None)
-    wait_for(
-        "the relay that took the order has its end", lambda: fleet.listed(fleet.second)["stopped"] is None
-    )
-    fleet.resume(fleet.first)
-    wait_for("it may move", lambda: fleet.robot.stopped is None)
+    for way in ("http", "command line"):
+        if way == "http":
+            stop = {"robots": ["r*"], "do": "stop", "stop_id": "one press"}
+            answer = httpx.post(url, headers=headers, json=stop, timeout=PATIENCE)
+            (line,) = [each for each in answer.text.splitlines() if '"ok":' in each and "done" not in each]
+            assert json.loads(line) | {"seconds": 0} == {
+                "robot": "rover", "ok": True, "message": "", "values": None, "pending": False, "seconds": 0
+            }  # fmt: skip
+        else:
+            fleet.second.run_cli("stop", "rover")
+        if way == "http":
+            assert fleet.robot.stopped is not None
+        wait_for("it is stopped", lambda: fleet.robot.stopped is not None)
+        fleet.resume(fleet.first)
+        wait_for("it may move", lambda: fleet.robot.stopped is None)
 
 
 def test_the_command_line_at_another_relay_reaches_modules(fleet: Fleet) -> None:

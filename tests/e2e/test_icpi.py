@@ -238,6 +238,7 @@ def test_a_part_that_did_not_stop_is_stopped_by_a_second_stop(world: World) -> N
             "some parts could not be stopped; stop the Role again",
             "valve: it is stuck",
         )
+        assert world.ann.delete(address).json()["code"] == "started"
         assert order("stop", "ok", "") == ("ok", "stopped")
     assert world.ann.get(f"{address}/run").json()["state"] == "stopped"
 

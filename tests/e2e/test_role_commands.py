@@ -337,6 +337,20 @@ def test_a_role_starts_what_it_can_and_its_state_is_live(world: World) -> None:
     assert world.clients["ann"].delete(f"/roles/{RUN}").status_code == 409
 
 
+def test_a_second_start_leaves_what_runs(world: World) -> None:
+    def carried() -> int:
+        (pipe,) = [
+            each for each in world.clients["ann"].get("/pipes").json()["pipes"] if each["name"][:5] == "role-"
+        ]
+        return int(pipe["messages"])
+
+    before = wait_for("it has carried messages", lambda: carried() if carried() > 5 else 0)
+    assert parts(world) == UP
+    run(world, "ann", "start")
+    assert carried() >= before
+    assert parts(world) == UP
+
+
 def test_it_outlives_the_relay(world: World) -> None:
     world.relay.stop()
     world.relay.start()

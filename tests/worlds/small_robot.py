@@ -74,6 +74,7 @@ class SmallRobot:
         self.holders: list[int] = []
         """Who had control of it, one after the other."""
         self.stopped: dict[str, str] | None = None
+        self._stopped_at = 0.0
         self.picture = b""
         """A JPEG that its camera shows; empty: it has no camera."""
         self.modules: list[str] = []
@@ -112,6 +113,8 @@ class SmallRobot:
         if self.modules:
             modules = [link.ModuleInfo(name=each, kind="command", state="running") for each in self.modules]
             control.send(link.Modules(modules=modules))
+        if self.stopped is not None:
+            control.send(link.MotionState(stopped=link.Stopped(**self.stopped, since=self._stopped_at)))
         self._listen(control, self._order)
         wait_for(f"{self.name} is online", lambda: self.relay.state_of(self.name) != "offline")
         return self
@@ -181,6 +184,7 @@ class SmallRobot:
             self.holders.append(message.get("holder", 0))
         elif op == "stop":
             self.stopped = {"by": message["by"], "why": message.get("why", "")}
+            self._stopped_at = time.time()
         elif op == "resume":
             self.stopped = None
         if "id" in message:

@@ -89,7 +89,13 @@ from relay_db.queries.function_jobs import (
     update_job,
     update_unfinished_job,
 )
-from relay_db.queries.home_relays import claim_home_relay, home_relay, home_relays, release_home_relay
+from relay_db.queries.home_relays import (
+    claim_home_relay,
+    home_relay,
+    home_relays,
+    reclaim_home_relay,
+    release_home_relay,
+)
 from relay_db.queries.login_limits import (
     add_login_failure,
     last_login_from,
@@ -239,7 +245,14 @@ from relay_db.queries.sharing import (
     share_robot,
     unshare_robot,
 )
-from relay_db.queries.stops import delete_stop, pending_stop, pending_stops, store_stop, store_stop_once
+from relay_db.queries.stops import (
+    RobotMoved,
+    delete_stop,
+    pending_stop,
+    pending_stops,
+    store_stop,
+    store_stop_once,
+)
 from relay_db.queries.tokens import (
     TokenKind,
     consume_login,
@@ -312,6 +325,7 @@ __all__ = [
     "RightRecord",
     "RobotGroupRecord",
     "RobotKeyRecord",
+    "RobotMoved",
     "RobotRecord",
     "RoleRecord",
     "RoleRunRecord",
@@ -438,6 +452,7 @@ __all__ = [
     "realm_size",
     "recent_alerts",
     "recent_audit_keys",
+    "reclaim_home_relay",
     "redeem_enrolment_code",
     "refresh_token_family",
     "refuse_module_order",

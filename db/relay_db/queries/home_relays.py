@@ -37,6 +37,19 @@ def claim_home_relay(s: Session, robot_id: int, relay: str) -> int:
     return epoch
 
 
+def reclaim_home_relay(s: Session, robot_id: int, relay: str, epoch: int) -> int | None:
+    """Record a relay as the home of a robot that has none.
+
+    :param epoch: of the robot's latest connection, which has ended
+    :returns: the new epoch; ``None`` if the robot has a newer connection, or a home
+    """
+    given_up = (HomeRelay.robot_id == robot_id) & (HomeRelay.relay == "") & (HomeRelay.epoch == epoch)
+    changed = (
+        update(HomeRelay).where(given_up).values(relay=relay, epoch=epoch + 1).returning(HomeRelay.epoch)
+    )
+    return s.scalar(changed)
+
+
 def release_home_relay(s: Session, robot_id: int, relay: str, epoch: int) -> None:
     """Record that a connection of a robot has ended; nothing changes if the robot has a newer one."""
     mine = (HomeRelay.robot_id == robot_id) & (HomeRelay.relay == relay) & (HomeRelay.epoch == epoch)

@@ -5,12 +5,16 @@ from __future__ import annotations
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
-from relay_db.models import Robot, StopOrder
+from relay_db.models import HomeRelay, Robot, StopOrder
 from relay_db.names import sanitise
 from relay_db.queries.records import StopRecord, fetch_all
 from relay_db.queries.revision import bump
 from relay_protocol.errors import NotFound
 from relay_protocol.limits import REASON_LENGTH, STOP_ID_LENGTH
+
+
+class RobotMoved(Exception):
+    """A robot is connected to another relay than was thought."""
 
 
 def store_stop(
@@ -22,6 +26,7 @@ def store_stop(
     stop_id: str = "",
     *,
     announce: bool = False,
+    home: str = "",
 ) -> StopRecord:
     """Store an order to stop. It replaces one that the robot has not confirmed yet.
 
@@ -30,13 +35,21 @@ def store_stop(
     :param at: Unix seconds
     :param stop_id: see :class:`StopRecord`
     :param announce: whether to count up the revision, so that other relays read it at once
+    :param home: id of the relay that the robot is connected to; empty: that does not matter
     :raises NotFound: no such robot
+    :raises RobotMoved: the robot is connected to another relay than ``home``; nothing is stored
     """
     if announce:
         # First, as in every change: other transactions lock in this order.
         bump(s)
     if s.scalar(select(Robot.id).where(Robot.id == robot_id).with_for_update()) is None:
         raise NotFound("there is no such robot")
+    if home and s.scalar(select(HomeRelay.relay).where(HomeRelay.robot_id == robot_id)) not in (
+        None,
+        "",
+        home,
+    ):
+        raise RobotMoved
     s.execute(delete(StopOrder).where(StopOrder.robot_id == robot_id))
     reason, stop_id = sanitise(why, REASON_LENGTH), sanitise(stop_id, STOP_ID_LENGTH)
     order = StopRecord(robot_id, sanitise(by), reason, float(at), stop_id)

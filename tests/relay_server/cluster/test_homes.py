@@ -6,10 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, succeed
 from twisted.internet.task import Clock
 
 from relay_db.queries import HomeRelayRecord
+from relay_protocol.errors import Unavailable
 from relay_server.cluster.bus import LocalBus
 from relay_server.cluster.homes import READ_SECONDS, ClusterHomes
 from relay_server.cluster.relays import RelayInfo
@@ -21,15 +22,27 @@ class FakeDatabase:
 
     def __init__(self) -> None:
         self.homes: dict[int, HomeRelayRecord] = {}
+        self.slow: Deferred[None] = succeed(None)
+        """Delays the answer to the next claim."""
 
     async def read(self, query: Any) -> list[HomeRelayRecord]:
         assert query.__name__ == "home_relays"
         return list(self.homes.values())
 
-    async def write(self, query: Any, robot: int, relay: str, *epoch: int) -> int | None:
-        known = self.homes.get(robot, HomeRelayRecord(robot, "", 0))
-        if query.__name__ == "claim_home_relay":
+    async def write(self, query: Any, robot: int, relay: str, *more: Any) -> int | None:
+        known, epoch = self.homes.get(robot, HomeRelayRecord(robot, "", 0)), more
+        if query.__name__ == "reclaim_home_relay":
+            if (known.relay, known.epoch) != ("", *epoch):
+                return None
             self.homes[robot] = HomeRelayRecord(robot, relay, known.epoch + 1)
+            return known.epoch + 1
+        if query.__name__ == "_claim":
+            (connected,) = more
+            if not connected():
+                raise Unavailable("the robot has disconnected")
+            self.homes[robot] = HomeRelayRecord(robot, relay, known.epoch + 1)
+            slow, self.slow = self.slow, succeed(None)
+            await slow
             return known.epoch + 1
         if (known.relay, known.epoch) == (relay, *epoch):
             self.homes[robot] = HomeRelayRecord(robot, "", known.epoch)
@@ -104,5 +117,50 @@ def test_a_link_that_answers_after_the_robot_connected_to_another_relay_is_repor
     assert elsewhere.id == "two"
     assert [first.homes.other(each) for each in ("two", "one", "")] == [elsewhere, None, None]
     assert second.homes.elsewhere(1) is None
+    for each in (first, second):
+        each.homes.stop()
+
+
+def test_a_relay_that_learns_late_that_it_was_the_home_does_not_register_the_robot() -> None:
+    """The robot has connected to another relay meanwhile, which all know."""
+    clock, database = Clock(), FakeDatabase()
+    bus = LocalBus(clock)
+    first, second = (Member(name, clock, database, bus) for name in ("one", "two"))
+    slow = database.slow = Deferred()
+    connecting = Deferred.fromCoroutine(first.homes.connecting(first.robot, "192.0.2.1"))
+    second.connect("192.0.2.2")
+    clock.advance(0)
+    slow.callback(None)
+    errors: list[Any] = []
+    connecting.addErrback(errors.append)
+    assert [each.type for each in errors] == [Unavailable]
+    # Registered nevertheless, by another connection of that time: the next read closes it, once.
+    link: Any = FakeLink()
+    first.robot.control_link = link
+    clock.advance(READ_SECONDS)
+    assert link.answers is not None
+    link.answers = None
+    clock.advance(READ_SECONDS)
+    assert link.answers is None
+    for each in (first, second):
+        each.homes.stop()
+
+
+def test_a_robot_that_has_gone_is_not_taken_from_the_relay_that_it_is_connected_to() -> None:
+    clock, database = Clock(), FakeDatabase()
+    bus = LocalBus(clock)
+    first, second = (Member(name, clock, database, bus) for name in ("one", "two"))
+    link = first.connect("192.0.2.1")
+    claimed = Deferred.fromCoroutine(second.homes.connecting(second.robot, "192.0.2.1", lambda: False))
+    errors: list[Any] = []
+    claimed.addErrback(errors.append)
+    assert [each.type for each in errors] == [Unavailable]
+    # The connection to the second relay was recorded, and ended before it was registered.
+    database.homes[1] = HomeRelayRecord(1, "", 2)
+    clock.advance(READ_SECONDS)
+    assert (link.answers, database.homes[1]) == (None, HomeRelayRecord(1, "one", 3))
+    clock.advance(0)
+    elsewhere = second.homes.elsewhere(1)
+    assert elsewhere is not None and elsewhere.id == "one"
     for each in (first, second):
         each.homes.stop()

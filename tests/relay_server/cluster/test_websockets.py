@@ -182,7 +182,7 @@ def forwarded(early: bool = False) -> tuple[Clock, Endpoints, ClientTransport, F
     clock, endpoints, transport = Clock(), Endpoints(), ClientTransport()
     handshake = ForwardedHandshake("/robots/rover", [], "")
     relay = RelayInfo("b", "10.0.0.2", 9092, "1", 0.0)
-    session = ForwardedWebSocket(clock, endpoints, relay, handshake, CLIENT, transport, 0)
+    session = ForwardedWebSocket(clock, endpoints, relay, 1, handshake, CLIENT, transport, 0)
     outcome: list[Any] = []
     Deferred.fromCoroutine(session.open()).addBoth(outcome.append)
     return clock, endpoints, transport, session, outcome

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import pytest
+from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
 from relay_server.access import Principal
@@ -110,3 +111,42 @@ def test_programs_of_a_user_share_the_limit_of_messages() -> None:
     clock.advance(0.02)
     second.message(REQUEST)
     assert seen.results[1] == ("ok", "[]")
+
+
+def test_a_stop_gets_through_beside_a_flood_and_slow_requests() -> None:
+    waiting: list[Deferred[Principal]] = []
+
+    async def authenticate(token: str) -> Principal:
+        held: Deferred[Principal] = Deferred()
+        waiting.append(held)
+        return await held
+
+    clock: Any = Clock()
+    unused = cast(Any, None)
+    services = IcpiServices(clock, ProgramRegistry(), unused, unused, authenticate, lambda: 0)
+    transport = Transport()
+    session = IcpiSession(services, cast(Any, transport), principal(1), "1", "here", lambda _: None)
+    for _ in range(240):
+        session.message(REQUEST)
+    assert len(waiting) == 32
+    session.message(write(IcpiMessage("Role", "test", "s", True, "stop")).encode())
+    assert len(waiting) == 33
+
+
+def test_a_program_that_has_left_is_not_registered() -> None:
+    waiting: list[Deferred[Principal]] = []
+
+    async def authenticate(token: str) -> Principal:
+        held: Deferred[Principal] = Deferred()
+        waiting.append(held)
+        return await held
+
+    clock: Any = Clock()
+    unused = cast(Any, None)
+    programs = ProgramRegistry()
+    services = IcpiServices(clock, programs, unused, unused, authenticate, lambda: 0)
+    session = IcpiSession(services, cast(Any, Transport()), principal(1), "1", "here", lambda _: None)
+    session.message(write(IcpiMessage("relay", "", "1", True, "register", ("lamp", "[]", "[]"))).encode())
+    session.end()
+    waiting[0].callback(principal(1))
+    assert programs.of(1) == []

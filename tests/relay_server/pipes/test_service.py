@@ -18,11 +18,14 @@ from relay_server.access import Principal
 from relay_server.channels.samples import Converter
 from relay_server.cluster.relays import RelayInfo
 from relay_server.pipes import service as module
+from relay_server.pipes.running_pipe import RunningPipe
 from relay_server.pipes.schemas import FieldMapping, NewPipe, PipeEnd, PipeList
 from relay_server.pipes.service import PipeUser, local_pipe_user, merge_pipes, pipe_user
 from tests.worlds.pipes import PipeScene, copy, settled
 from tests.worlds.relay import STRING, TWIST, Person, text, words
 from tests.worlds.session_manager import HERE
+
+COPY = PipeEnd("rover", "/copy", STRING)
 
 
 @pytest_twisted.ensureDeferred
@@ -218,6 +221,34 @@ async def test_one_user_has_so_many_pipes_at_most(scene: PipeScene, monkeypatch:
         await scene.service.add(ann, copy("second"))
     with pytest.raises(Invalid, match="are for the pipes of Roles"):
         await scene.service.add(ann, copy("role-1-1"))
+
+
+@pytest_twisted.ensureDeferred
+async def test_mappings_that_write_into_each_other_are_refused(scene: PipeScene) -> None:
+    ann = await scene.begin()
+    for targets in (("a", "a"), ("a.b", "a"), ("a", "a.b.c"), ("a", "a_b", "a.b")):
+        fields = [FieldMapping("data", each) for each in targets]
+        with pytest.raises(Invalid, match="two mappings write 'a"):
+            await scene.service.add(
+                ann, NewPipe(name="x", source=PipeEnd("rover", "/chatter"), target=COPY, fields=fields)
+            )
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_error_of_the_relay_ends_the_pipe_and_not_the_data_of_others(
+    scene: PipeScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ann = await scene.begin()
+    await scene.service.add(ann, copy())
+    scene.joins()
+
+    def fails(*_: object) -> bool:
+        raise TypeError("not foreseen")
+
+    monkeypatch.setattr(RunningPipe, "_carry", fails)
+    scene.sends(text("hello"))
+    await settled(scene)
+    assert await scene.state(ann) == ("refused", "the relay failed on a message; see its log")
 
 
 @pytest_twisted.ensureDeferred

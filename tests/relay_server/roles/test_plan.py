@@ -147,4 +147,19 @@ def test_a_mapping_to_an_element_of_another_role_needs_that_role() -> None:
         "Z": {"Other": ["robots/pad/topics/z#/data"]},
     }
     found = [(each.element, each.needs) for each in plan_of(2, elements, others)]
-    assert found == [("A → X", ["Drive"]), ("A → Y", []), ("Z → Y", ["Other"])]
+    assert found == [("A → X", [["Drive"]]), ("A → Y", []), ("Z → Y", [["Other"]])]
+
+
+def test_any_of_the_roles_that_have_an_element_is_enough() -> None:
+    """The same resource in several Roles is carried once; another resource of one of them is carried, too."""
+    elements = [element("A", "robots/pad/topics/joy#/axes/0", mappings=("X",))]
+    speed, turn = "robots/rover/topics/cmd_vel#/linear/x", "robots/arm/topics/turn#/data"
+    others = {"X": {"Drive": [speed], "Ride": [speed, turn]}}
+    first, second = plan_of(2, elements, others)
+    assert (first.element, first.needs, len(msgspec.json.decode(first.new, type=NewPipe).fields)) == (
+        "A → X",
+        [["Drive", "Ride"]],
+        1,
+    )
+    assert second.needs == [["Ride"]]
+    assert [first.waits_for(each) for each in ([], ["Drive"], ["Ride"])] == ["Drive or Ride", "", ""]

@@ -175,3 +175,17 @@ async def test_after_its_death_the_process_begins_again() -> None:
     await process.close()
     with pytest.raises(Unavailable, match="shutting down"):
         await process.ask("roles_of", text="fierro:AXIS_0", **HERE)
+
+
+@pytest_twisted.ensureDeferred
+async def test_resources_of_an_element_are_those_of_the_roles_that_may_be_used(process: RoleProcess) -> None:
+    """However many others have it."""
+    resource = '<fierro:X> <switchboard:resource> "robots/rover/topics/x" .'
+    for number in range(150):
+        await process.ask("put", realm="wide", name=f"W{number}", text=resource)
+    one = {"realm": "wide", "items": ["fierro:X", "fierro:Y"]}
+    for number in (0, 77, 149):
+        found = await process.ask("resources_of", names=[f"W{number}"], **one)
+        assert found == [["fierro:X", f"W{number}", "robots/rover/topics/x"]]
+    with pytest.raises(Invalid, match="more than 100 resources"):
+        await process.ask("resources_of", names=None, **one)

@@ -68,6 +68,14 @@ def test_only_commands_that_the_reader_may_send_appear() -> None:
     assert role_model("Role", elements, {})["properties"].keys() == {"role-state"}
 
 
+def test_a_module_is_judged_by_its_name() -> None:
+    allowed = RoleRobot(Rules([Grant(Level.VIEWER, allow=("manage:driver",))]), GRAPH)
+    denied = RoleRobot(Rules([Grant(Level.OWNER, deny=("manage:driver",))]), GRAPH)
+    for robot, offered in ((allowed, True), (denied, False)):
+        found = role_description("R", "R@lab", [element("M", "modules/driver")], {"pad": robot}, "https://r")
+        assert ("start-M" in found["actions"]) is offered
+
+
 def test_a_model_has_no_addresses() -> None:
     robots = {"pad": RoleRobot(Rules([Grant(Level.OPERATOR)]), GRAPH)}
     model = role_model("Role", [element("BEEP", "services/beep")], robots)
