@@ -171,7 +171,8 @@ class DeviceRegistry:
         self._keys: dict[str, str] = {}
         """Key of the device by source."""
         self._changed: dict[str, None] = {}
-        self._items = 0
+        self._count = 0
+        """Elements and services in all parts."""
 
     def set_part(self, source: str, part: DevicePart | None) -> None:
         """Replace what one source says.
@@ -189,23 +190,56 @@ class DeviceRegistry:
             raise Invalid(
                 f"there are {MAX_DEVICES} devices, the most there may be; '{part.name[:60]}' is left out"
             )
+        try:
+            self._check_size(source, part)
+        except Invalid:
+            if source in self._keys:
+                self._remove(source, part.key)
+            raise
         of_device = self._parts.setdefault(part.key, {})
-        if source not in of_device and len(of_device) >= MAX_DEVICE_ITEMS:
-            raise Invalid(f"'{part.name[:60]}' has more than {MAX_DEVICE_ITEMS} discovery messages")
+        self._count += _size(part) - (_size(of_device[source]) if source in of_device else 0)
         of_device[source] = part
         self._keys[source] = part.key
         self._changed[part.key] = None
 
+    def _check_size(self, source: str, part: DevicePart) -> None:
+        """Before it is kept, so that what is kept, and the work with it, has limits.
+
+        :raises Invalid: its device, or all, would have too much
+        """
+        of_device = self._parts.get(part.key, {})
+        name, old = part.name[:60], _size(of_device[source]) if source in of_device else 0
+        if source not in of_device and len(of_device) >= MAX_DEVICE_ITEMS:
+            raise Invalid(f"'{name}' has more than {MAX_DEVICE_ITEMS} discovery messages")
+        if sum(map(_size, of_device.values())) - old + _size(part) > MAX_DEVICE_ITEMS:
+            raise Invalid(
+                f"'{name}' has more than {MAX_DEVICE_ITEMS} elements and services; those of {source} are left out"
+            )
+        if self._count - old + _size(part) > MAX_ITEMS:
+            raise Invalid(
+                f"all devices have more than {MAX_ITEMS} elements and services; '{name}' is left out"
+            )
+
     def _remove(self, source: str, key: str) -> None:
         del self._keys[source]
-        del self._parts[key][source]
+        self._count -= _size(self._parts[key].pop(source))
         if not self._parts[key]:
             del self._parts[key]
         self._changed[key] = None
 
-    def flush(self) -> DeviceChanges:
-        """Build the devices that changed."""
-        changed, self._changed = self._changed, {}
+    @property
+    def has_changed(self) -> bool:
+        """Whether :meth:`flush` has something to build."""
+        return bool(self._changed)
+
+    def flush(self, most: int | None = None) -> DeviceChanges:
+        """Build the devices that changed.
+
+        :param most: that are built; the others are built by the next call
+        """
+        changed = list(self._changed)[:most]
+        for key in changed:
+            del self._changed[key]
         found: dict[str, MqttDevice | None] = {}
         for key in changed:
             try:
@@ -245,11 +279,8 @@ class DeviceRegistry:
 
     def _replace(self, name: str, device: MqttDevice | None, found: dict[str, MqttDevice | None]) -> None:
         before = self.devices.pop(name, None)
-        if before is not None:
-            self._items -= len(before.elements) + len(before.calls)
         if device is not None:
             self.devices[name] = device
-            self._items += len(device.elements) + len(device.calls)
         if before is not None or device is not None:
             found[name] = device
 
@@ -263,20 +294,16 @@ class DeviceRegistry:
                 elements[_free(used, name, element.name)] = element
             for call in part.calls:
                 calls[_free(used, name, call.name)] = call
-        before = self.devices.get(name)
-        others = self._items - (len(before.elements) + len(before.calls) if before else 0)
-        if len(elements) + len(calls) > MAX_DEVICE_ITEMS:
-            raise Invalid(f"'{name}' has more than {MAX_DEVICE_ITEMS} elements and services, and is left out")
-        if others + len(elements) + len(calls) > MAX_ITEMS:
-            raise Invalid(
-                f"all devices have more than {MAX_ITEMS} elements and services; '{name}' is left out"
-            )
         availability = tuple(dict.fromkeys(each for part in ordered for each in _hashable(part.availability)))
         if len({source for part in availability for source in part.sources}) > MAX_DEVICE_ITEMS:
             raise Invalid(
                 f"'{name}' has more than {MAX_DEVICE_ITEMS} sources of its availability, and is left out"
             )
         return MqttDevice(name, ordered[0].name, elements, calls, availability)
+
+
+def _size(part: DevicePart) -> int:
+    return len(part.elements) + len(part.calls)
 
 
 def _hashable(availability: Iterable[PartAvailability]) -> list[PartAvailability]:

@@ -45,6 +45,9 @@ MAX_ATTRIBUTES = 1500
 HOMIE_QOS = 1
 """Quality of service of commands, as the convention recommends."""
 
+MAX_BYTES = 32 * 1024 * 1024
+"""Of the attributes of all devices."""
+
 _ID = re.compile(r"[a-z0-9][a-z0-9-]*\Z")
 _ANNOUNCED = ANNOUNCED.replace("_", "-")
 _AVAILABLE = ("ready", "sleeping", "alert")
@@ -71,6 +74,7 @@ class HomieDevices:
         self.domain = domain
         self._attributes: dict[str, dict[str, str]] = {}
         self._changed: set[str] = set()
+        self._bytes = 0
 
     def handle(self, topic: str, payload: bytes) -> bool:
         """Take an attribute; return whether the topic is one.
@@ -95,7 +99,8 @@ class HomieDevices:
             raise Invalid(f"an attribute of {len(payload)} bytes is larger than {most}")
         if not payload:
             if attribute in ("$homie", "$state", "$description"):
-                self._attributes.pop(device, None)
+                gone = self._attributes.pop(device, {})
+                self._bytes -= sum(map(_bytes, gone.values()))
                 self._changed.add(device)
             return
         known = self._attributes.get(device)
@@ -108,19 +113,33 @@ class HomieDevices:
         text = payload.decode("utf-8", "replace")
         if known.get(attribute) == text:
             return
+        more = _bytes(text) - _bytes(known.get(attribute, ""))
+        if self._bytes + more > MAX_BYTES:
+            raise Invalid(
+                f"Homie devices have more than {MAX_BYTES >> 20} MiB of attributes; '{device[:60]}' is too much"
+            )
+        self._bytes += more
         known[attribute] = text
         # A change of the state alone is a matter of availability.
         if attribute != "$state" or text in _AVAILABLE:
             self._changed.add(device)
 
-    def take_changed(self) -> list[tuple[str, DevicePart | None]]:
+    @property
+    def has_changed(self) -> bool:
+        """Whether :meth:`take_changed` has something to return."""
+        return bool(self._changed)
+
+    def take_changed(self, most: int | None = None) -> list[tuple[str, DevicePart | None]]:
         """Devices that changed since the last call, each with the topic it is known by; ``None``: it is gone.
 
         Devices that are not complete yet are left out.
+
+        :param most: that are looked at; the others come with the next call
         """
-        changed, self._changed = self._changed, set()
         found: list[tuple[str, DevicePart | None]] = []
-        for device in sorted(changed):
+        changed = sorted(self._changed)[:most]
+        self._changed.difference_update(changed)
+        for device in changed:
             source = f"{self.domain}/{device}"
             attributes = self._attributes.get(device)
             if attributes is None:
@@ -131,6 +150,11 @@ class HomieDevices:
                 if part is not None:
                     found.append((source, part))
         return found
+
+
+def _bytes(text: str) -> int:
+    """Bytes that a text needs at least."""
+    return len(text) if text.isascii() else len(text.encode())
 
 
 def _device_4(source: str, attributes: Mapping[str, str]) -> DevicePart | None:

@@ -53,6 +53,9 @@ from robot_client.platforms.mqtt.messages import BOOL, TEXT, TRIGGER
 from robot_client.platforms.mqtt.model import DeviceCall, StateCommand
 from robot_client.platforms.mqtt.settings import MqttSettings
 
+DEVICES_AT_ONCE = 50
+"""Devices that are built in one turn."""
+
 TURN_SECONDS = 0.01
 """Time for messages before other work of the reactor gets its turn."""
 
@@ -359,7 +362,7 @@ class MqttPlatform(Platform):
 
     def _apply_changes(self) -> None:
         self._settle = None
-        for source, part in self._homie.take_changed():
+        for source, part in self._homie.take_changed(DEVICES_AT_ONCE):
             try:
                 self._registry.set_part(source, part)
                 self._problems.set(source, part.problems if part is not None else [])
@@ -367,7 +370,7 @@ class MqttPlatform(Platform):
                 self._problems.set(source, [str(error)])
         added: dict[str, None] = {}
         removed: dict[str, None] = {}
-        changes = self._registry.flush().devices
+        changes = self._registry.flush(DEVICES_AT_ONCE).devices
         for name, device in changes.items():
             self._replace(name, device, added, removed)
         if changes:
@@ -376,6 +379,8 @@ class MqttPlatform(Platform):
             self._broker.subscribe(added)
             self._update_publishers()
         self._publish_problems()
+        if self._homie.has_changed or self._registry.has_changed:
+            self._settle = self._reactor.callLater(0.001, self._apply_changes)
 
     def _replace(
         self, name: str, device: MqttDevice | None, added: dict[str, None], removed: dict[str, None]

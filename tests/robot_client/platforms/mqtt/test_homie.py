@@ -7,6 +7,7 @@ import json
 import pytest
 
 from relay_protocol.errors import Invalid
+from robot_client.platforms.mqtt import homie
 from robot_client.platforms.mqtt.homie import MAX_DEVICES, HomieDevices
 from robot_client.platforms.mqtt.messages import BOOL, NUMBER, TEXT
 from robot_client.platforms.mqtt.model import DevicePart
@@ -152,6 +153,25 @@ def test_floods_are_bounded() -> None:
         devices.handle("homie/d1/$name", b"x" * 5000)
     with pytest.raises(Invalid, match="not valid"):
         devices.handle("homie/D 1/$name", b"x")
+
+
+def test_all_attributes_have_a_limit_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(homie, "MAX_BYTES", 20_000)
+    devices = HomieDevices("homie")
+    for number in range(4):
+        devices.handle(f"homie/d{number}/$name", b"x" * 4000)
+    with pytest.raises(Invalid, match="'d5' is too much"):
+        for each in ("$homie", "$nodes", "$name"):
+            devices.handle(f"homie/d5/{each}", b"x" * 4000)
+    # What is replaced or gone makes room.
+    devices.handle("homie/d1/$name", b"x")
+    devices.handle("homie/d2/$homie", b"")
+    for each in ("$nodes", "$name"):
+        devices.handle(f"homie/d5/{each}", b"y" * 3900)
+    sizes = []
+    while devices.has_changed:
+        sizes.append(len(devices.take_changed(2)))
+    assert sizes == [0, 1, 0]
 
 
 @pytest.mark.parametrize("topic", ["homie/th-1/heat/target", "other/th-1/$homie", "homie/$x"])
