@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import socket
 import ssl
+import struct
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
 import paho.mqtt.client as paho
@@ -34,6 +36,13 @@ MAX_UNSENT = 1000
 
 COMMAND_EXPIRY = 10
 """Seconds after which the broker drops a command for a device that is not connected (MQTT 5)."""
+
+CONFIRM_SECONDS = 2.0
+"""Seconds in which the broker must have read a command; then the connection is cut, so that no command of it comes
+through later."""
+
+PROBE = "switchboard/none"
+"""A topic that nobody subscribes: to unsubscribe it is answered once all commands before have been read."""
 
 KEEPALIVE = 20
 CONNECT_SECONDS = 10.0
@@ -182,6 +191,11 @@ class PahoBroker:
         self._retry: Any = None
         self._connected_at: float | None = None
         self._scheduled = threading.Event()
+        self._probe = 0
+        """Number of the request that the broker answers once it has read the commands before it; 0: none."""
+        self._probe_timer: Any = None
+        self._unproven = False
+        """Whether commands were sent after that request."""
         self._log = Logger("mqtt")
 
     @property
@@ -200,6 +214,7 @@ class PahoBroker:
             self._retry.cancel()
             self._retry = None
         attempt, self._attempt = self._attempt, None
+        self._end_probe()
         if attempt is not None:
             attempt.end()
 
@@ -227,6 +242,35 @@ class PahoBroker:
         if self._attempt is None or self._connected_at is None:
             raise Unavailable("the gateway is not connected to the MQTT broker")
         self._attempt.publish(topic, payload, qos, retain, stops)
+        if self._probe:
+            self._unproven = True
+        else:
+            self._send_probe(self._attempt)
+
+    def _send_probe(self, attempt: _Attempt) -> None:
+        self._unproven = False
+        self._probe = attempt.probe()
+        if self._probe:
+            self._probe_timer = self._reactor.callLater(CONFIRM_SECONDS, self._not_read, attempt)
+
+    def read(self, attempt: _Attempt, number: int) -> None:
+        """The broker has read what was sent before this request."""
+        if attempt is not self._attempt or number != self._probe:
+            return
+        self._end_probe()
+        if self._unproven:
+            self._send_probe(attempt)
+
+    def _end_probe(self) -> None:
+        self._probe = 0
+        timer, self._probe_timer = self._probe_timer, None
+        if timer is not None and timer.active():
+            timer.cancel()
+
+    def _not_read(self, attempt: _Attempt) -> None:
+        self._probe_timer = None
+        if attempt is self._attempt:
+            attempt.abort(f"the broker has not read a command within {CONFIRM_SECONDS:g} s")
 
     # --- from the thread -----------------------------------------------------------------------------------
 
@@ -261,6 +305,7 @@ class PahoBroker:
         if attempt is not self._attempt:
             return
         self._attempt = None
+        self._end_probe()
         lasted = 0.0 if self._connected_at is None else self._reactor.seconds() - self._connected_at
         self._connected_at = None
         self._scheduled.clear()
@@ -294,6 +339,7 @@ class _Attempt:
         client.on_disconnect = self._on_disconnect
         client.on_message = self._on_message
         client.on_publish = self._on_publish
+        client.on_unsubscribe = self._on_unsubscribe
 
     def start(self) -> None:
         """Connect, in a thread."""
@@ -303,6 +349,20 @@ class _Attempt:
         """Disconnect; the thread ends by itself."""
         self._ended = True
         self.client.disconnect()
+
+    def abort(self, reason: str) -> None:
+        """Cut the connection: what the network has not taken yet is dropped."""
+        self._reason = reason
+        connection: Any = self.client.socket()
+        if connection is not None:
+            with suppress(OSError):
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                connection.shutdown(socket.SHUT_RDWR)
+
+    def probe(self) -> int:
+        """Send a request that the broker answers after it has read all commands; its number, or 0."""
+        result, number = self.client.unsubscribe(PROBE)
+        return number if result == paho.MQTT_ERR_SUCCESS and number is not None else 0
 
     def publish(self, topic: str, payload: str, qos: int, retain: bool, stops: bool) -> None:
         """See :meth:`BrokerPort.publish`."""
@@ -354,7 +414,7 @@ class _Attempt:
             self._owner.call(self._owner.connected, self)
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, code: Any, _properties: Any) -> None:
-        if code.is_failure and not self._reason.startswith("the broker refused"):
+        if code.is_failure and not self._reason.startswith(("the broker refused", "the broker has not")):
             self._reason = f"the connection was lost: {code}"
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
@@ -363,6 +423,9 @@ class _Attempt:
         except UnicodeDecodeError:
             return
         self._owner.received(self, topic, bytes(message.payload))
+
+    def _on_unsubscribe(self, _client: Any, _data: Any, number: int, *_: Any) -> None:
+        self._owner.call(self._owner.read, self, number)
 
     def _on_publish(self, _client: Any, _data: Any, _id: int, _code: Any, _properties: Any) -> None:
         self._confirmed()

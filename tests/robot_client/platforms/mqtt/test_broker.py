@@ -18,8 +18,28 @@ from robot_client.platforms.mqtt import broker as broker_module
 from robot_client.platforms.mqtt.broker import Inbox, MqttMessage, PahoBroker
 from robot_client.platforms.mqtt.settings import PASSWORD_VARIABLE, MqttSettings, read_password
 from tests.robot_client.link.test_tls import Authority
+from tests.worlds.chaos_proxy import ChaosProxy
 from tests.worlds.mosquitto import PASSWORD, USER, Mosquitto
 from tests.worlds.waiting import PATIENCE
+
+
+class Timer:
+    """A call that the test makes."""
+
+    def __init__(self, reactor: QueueReactor, call: Callable[[], None]) -> None:
+        self._reactor = reactor
+        self._call = call
+
+    def active(self) -> bool:
+        return self in self._reactor.timers
+
+    def cancel(self) -> None:
+        self._reactor.timers.remove(self)
+
+    def __call__(self) -> None:
+        if self.active():
+            self.cancel()
+        self._call()
 
 
 class QueueReactor:
@@ -27,7 +47,7 @@ class QueueReactor:
 
     def __init__(self) -> None:
         self._calls: queue.Queue[Callable[[], None]] = queue.Queue()
-        self.timers: list[Callable[[], None]] = []
+        self.timers: list[Timer] = []
 
     def seconds(self) -> float:
         return time.monotonic()
@@ -35,8 +55,10 @@ class QueueReactor:
     def callFromThread(self, function: Callable[..., None], *arguments: Any) -> None:
         self._calls.put(lambda: function(*arguments))
 
-    def callLater(self, _: float, function: Callable[[], None]) -> None:
-        self.timers.append(function)
+    def callLater(self, _: float, function: Callable[..., None], *arguments: Any) -> Timer:
+        timer = Timer(self, lambda: function(*arguments))
+        self.timers.append(timer)
+        return timer
 
     def until(self, condition: Callable[[], object]) -> None:
         end = time.monotonic() + PATIENCE
@@ -146,6 +168,36 @@ def test_command_of_a_lost_connection_is_not_sent_by_the_next_one(mosquitto: Mos
     assert watcher.messages == [("late/marker", b"x")]
     client.broker.stop()
     watcher.broker.stop()
+
+
+def test_a_connection_on_which_the_broker_reads_no_command_is_cut(mosquitto: Mosquitto) -> None:
+    """The network stands still, and the connection does not end by itself."""
+    direct = Connected(broker=mosquitto.address)
+    assert direct.next() == "connected"
+    direct.broker.subscribe(["blind/set"])
+    proxy = ChaosProxy(mosquitto.port)
+    client = Connected(broker=f"127.0.0.1:{proxy.port}")
+    assert client.next() == "connected"
+    client.broker.publish("blind/set", "first")
+    client.broker.publish("blind/set", "second")
+    direct.reactor.until(lambda: len(direct.messages) == 2)
+    client.reactor.until(lambda: not client.reactor.timers)
+    proxy.black_hole()
+    client.broker.publish("blind/set", "OPEN")
+    (late,) = client.reactor.timers
+    late()
+    assert client.next() == "the broker has not read a command within 2 s"
+    proxy.reset()
+    proxy.heal()
+    # A new connection, by the timer of the next attempt.
+    client.reactor.timers[0]()
+    assert client.next() == "connected"
+    client.broker.publish("blind/set", "last")
+    direct.reactor.until(lambda: len(direct.messages) == 3)
+    assert [each.payload for each in direct.messages] == [b"first", b"second", b"last"]
+    for each in (client, direct):
+        each.broker.stop()
+    proxy.close()
 
 
 def test_too_many_commands_are_refused(mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch) -> None:
