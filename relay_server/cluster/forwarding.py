@@ -10,11 +10,11 @@ import base64
 import hmac
 from collections.abc import Callable, Sequence
 from io import BytesIO
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from twisted.internet.address import IPv4Address, IPv6Address
-from twisted.internet.defer import Deferred, DeferredList, TimeoutError
+from twisted.internet.defer import CancelledError, Deferred, DeferredList, TimeoutError
 from twisted.internet.endpoints import HostnameEndpoint, wrapClientTLS
 from twisted.internet.error import ConnectError, DNSLookupError
 from twisted.internet.protocol import Protocol as TwistedProtocol
@@ -41,10 +41,12 @@ from relay_server.access import LOOKUP_SECONDS, NOT_LOOKED_UP, Access, Principal
 from relay_server.cluster.homes import RobotHomes
 from relay_server.cluster.relays import RelayInfo, check_compatible, lost, unreachable
 from relay_server.common import close_codes
-from relay_server.common.clock import Clock
+from relay_server.common.clock import Clock, sleep
 from relay_server.common.concurrency import with_timeout
 from relay_server.config import ClusterSettings
 from relay_server.robots.registry import RobotRegistry
+
+T = TypeVar("T")
 
 CLUSTER_HEADER = "Switchboard-Cluster"
 """Header with the secret that all relays of the cluster have."""
@@ -56,6 +58,10 @@ LIST_SECONDS = 5.0
 """Seconds in which another relay must have sent its part of a list."""
 FORWARDED_SECONDS = 600.0
 """Additional time of a request that another relay answers, which has time limits of its own."""
+WATCH_SECONDS = 5.0
+"""Seconds between short requests to a relay whose answer is waited for, and in which it must answer them."""
+ANYTHING = "/api/v1/cluster/alive"
+"""A path that is answered without the database; any answer will do."""
 IDLE_CONNECTIONS = 16
 """Most idle connections that are kept to another relay."""
 
@@ -205,12 +211,50 @@ class Forwarder:
         url = f"http://{relay.address}{path}".encode()
         try:
             producer = FileBodyProducer(BytesIO(body)) if body else None
-            response = await self._agent.request(method.encode(), url, fields, producer)
-            return response.code, await readBody(response)
+            sending = self._agent.request(method.encode(), url, fields, producer)
+            response = await self._while_it_answers(relay, sending)
+            return response.code, await self._while_it_answers(relay, readBody(response))
         except (ConnectError, DNSLookupError, TimeoutError):
             raise unreachable(relay) from None
         except (RequestTransmissionFailed, ResponseFailed, PartialDownloadError):
             raise lost(relay) from None
+
+    async def _while_it_answers(self, relay: RelayInfo, waiting: Deferred[T]) -> T:
+        """Wait for another relay, whose time limits are not known here, for as long as it answers anything at all.
+
+        :raises Unavailable: it stands still
+        """
+        silent = False
+        watching: Deferred[None] = Deferred.fromCoroutine(self._watch(relay))
+
+        def end(_: Any) -> None:
+            nonlocal silent
+            silent = True
+            waiting.cancel()
+
+        watching.addCallbacks(end, lambda failure: failure.trap(CancelledError))
+        try:
+            return await waiting
+        except (CancelledError, ResponseFailed, PartialDownloadError):
+            if silent:
+                raise lost(relay) from None
+            raise
+        finally:
+            watching.cancel()
+
+    async def _watch(self, relay: RelayInfo) -> None:
+        """Return when a relay does not answer a short request in time."""
+        while True:
+            await sleep(self._reactor, WATCH_SECONDS)
+            fields = Headers({CLUSTER_HEADER: [self._settings.secret]})
+            asking = self._agent.request(b"GET", f"http://{relay.address}{ANYTHING}".encode(), fields)
+            asking.addTimeout(WATCH_SECONDS, self._reactor)
+            try:
+                await readBody(await asking)
+            except CancelledError:
+                raise
+            except Exception:
+                return
 
     async def ask_all(
         self, method: str, path: str, body: bytes, relays: Sequence[RelayInfo], client: ForwardedClient
@@ -264,7 +308,7 @@ class Forwarder:
         if seconds is not None:
             sending.addTimeout(seconds, self._reactor)
         try:
-            response = await sending
+            response = await self._while_it_answers(relay, sending)
         except (ConnectError, DNSLookupError, TimeoutError):
             raise unreachable(relay) from None
         except (RequestTransmissionFailed, ResponseFailed):

@@ -549,6 +549,29 @@ def test_recordings_and_files_are_found_at_the_relay_that_has_them(fleet: Fleet)
     fleet.connect_at(fleet.first, fleet.second)
 
 
+def test_a_home_that_stands_still_lets_no_request_wait(fleet: Fleet) -> None:
+    """The request would have ten minutes. The websocket ends when the robot is at another relay."""
+    fleet.connect_at(fleet.first, fleet.second)
+    with fleet.second.connect("rover", fleet.token) as client:
+        assert client.call("/say")["result"]
+        fleet.first.freeze()
+        try:
+            answer = fleet.get(fleet.second, "/params")
+            assert (answer.status_code, "relay" in answer.json()["detail"]) == (503, True), answer.text
+            fleet.connect_at(fleet.second)
+            with pytest.raises(ConnectionClosed) as closed:
+                while True:
+                    client.receive()
+            assert closed.value.rcvd is not None
+            assert (closed.value.rcvd.code, "connected to another relay" in closed.value.rcvd.reason) == (
+                4503,
+                True,
+            )
+        finally:
+            fleet.first.thaw()
+    fleet.connect_at(fleet.first, fleet.second)
+
+
 def test_death_of_the_home_relay_is_explained(fleet: Fleet) -> None:
     with fleet.second.connect("rover", fleet.token) as client:
         assert client.call("/say")["result"]

@@ -42,7 +42,7 @@ CONFIRM_SECONDS = 2.0
 through later."""
 
 PROBE = "switchboard/none"
-"""A topic that nobody subscribes: to unsubscribe it is answered once all commands before have been read."""
+"""A topic without subscription: a request to unsubscribe it is answered once all commands before have been read."""
 
 KEEPALIVE = 20
 CONNECT_SECONDS = 10.0
