@@ -17,6 +17,7 @@ from relay_server.common import close_codes, websocket_frames
 from relay_server.common.clock import Clock, PeriodicTimer, PeriodicTimers
 from relay_server.common.concurrency import with_timeout
 from relay_server.common.errors import NotDone
+from relay_server.common.freshness_tokens import FreshnessTokenExpired
 from relay_server.common.send_queue import SendQueue
 from relay_server.common.token_bucket import Buckets
 from relay_server.icpi.messages import IcpiMessage, id_of, parse, write
@@ -56,6 +57,9 @@ REPLY_SECONDS = 10.0
 PING_SECONDS = 0.2
 QUIET_PINGS = 25
 """A program that has sent nothing recently gets one ping in so many."""
+
+COMMANDING_SECONDS = 600.0
+"""A program that has given a Role a command gets all pings for so long, so that the next one is not too old at once."""
 
 SILENT_SECONDS = 20.0
 """A program that has not answered a ping for this time is disconnected."""
@@ -126,6 +130,7 @@ class IcpiSession:
         self._pinging = PeriodicTimer(self._tick, PING_SECONDS)
         self._ticks = 0
         self._active = False
+        self._commanding_until = 0.0
         self._pings: dict[bytes, int] = {}
         self._last_pong = services.clock.seconds()
         self._closed = False
@@ -224,6 +229,8 @@ class IcpiSession:
             value = await self._carry_out(message, RoleUser(principal, self._address, sent))
             if message.acknowledge:
                 self._reply(message, "ok", value)
+        except FreshnessTokenExpired:
+            self._reply(message, "error", "the command may have been sent too long ago; send it again")
         except SwitchboardError as error:
             self._reply(message, "error", str(error))
         finally:
@@ -281,6 +288,8 @@ class IcpiSession:
     async def _for_role(self, message: IcpiMessage, user: RoleUser) -> str:
         """A command on an element of a Role, or on a whole Role."""
         commands, role, do = self._services.commands, message.dest, message.function
+        if do in ("set", "call", "start"):
+            self._commanding_until = self._services.clock.seconds() + COMMANDING_SECONDS
         if do in ("start", "stop") and not message.args:
             order = self._services.runs.start if do == "start" else self._services.runs.stop
             return (await order(user, role)).state
@@ -368,7 +377,11 @@ class IcpiSession:
         self._ticks += 1
         if self._services.clock.seconds() - self._last_pong > SILENT_SECONDS:
             self.close(close_codes.TOO_SLOW, f"no answer to pings for {SILENT_SECONDS:g} s")
-        elif self._active or self._ticks % QUIET_PINGS == 0:
+        elif (
+            self._active
+            or self._ticks % QUIET_PINGS == 0
+            or self._services.clock.seconds() < self._commanding_until
+        ):
             self.ping()
             if self._ticks % QUIET_PINGS == 0:
                 self._active = False

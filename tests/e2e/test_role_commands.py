@@ -165,7 +165,7 @@ def test_a_number_that_is_not_finite_moves_no_robot_by_icpi(world: World) -> Non
             result, words = parse(str(program.recv(PATIENCE))).args
             assert result == "error"
             # Until a ping proves how old its messages are; commands are limited for each user.
-            return "" if "older" in words or "too often" in words else words
+            return "" if "too long ago" in words or "too often" in words else words
 
         assert "must be finite" in wait_for("a command by ICPI is judged", refusal)
     assert world.ask("ann", "GET", "DRIVEN").json()["value"]["linear"]["x"] == 0

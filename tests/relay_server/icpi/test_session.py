@@ -150,3 +150,34 @@ def test_a_program_that_has_left_is_not_registered() -> None:
     session.end()
     waiting[0].callback(principal(1))
     assert programs.of(1) == []
+
+
+def test_a_program_that_commands_is_pinged_so_that_its_next_command_is_not_too_old() -> None:
+    async def authenticate(token: str) -> Principal:
+        return principal(1)
+
+    class Pinged(Transport):
+        pings = 0
+
+        def ping(self, payload: bytes) -> None:
+            self.pings += 1
+
+    clock: Any = Clock()
+    unused = cast(Any, None)
+    counts = []
+    for commands in (False, True):
+        services = IcpiServices(
+            clock, ProgramRegistry(), cast(Any, Commands()), unused, authenticate, lambda: 0
+        )
+        transport = Pinged()
+        session = IcpiSession(services, cast(Any, transport), principal(1), "1", "here", lambda _: None)
+        session.start()
+        if commands:
+            session.message(write(IcpiMessage("Role", "test", "1", True, "set", ("SPEED", "1"))).encode())
+        for _ in range(60):
+            clock.advance(0.2)
+            session.pong(next(reversed(session._pings), b""))
+        counts.append(transport.pings)
+        session.end()
+    assert counts[0] <= 3
+    assert counts[1] >= 58
