@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -101,8 +102,10 @@ class NatsBus:
     async def stop(self) -> None:
         """See :meth:`ClusterBus.stop`."""
         self._stopped = True
-        await self._deferred(self._disconnect())
-        self._loop.call_soon_threadsafe(self._loop.stop)
+        try:
+            await self._deferred(self._disconnect())
+        finally:
+            self._loop.call_soon_threadsafe(self._loop.stop)
         await _in_thread(self._reactor, self._thread.join)
         self._loop.close()
 
@@ -293,7 +296,9 @@ class NatsBus:
 
     async def _disconnect(self) -> None:
         if self._client.is_connected:
-            await self._client.flush(1)
+            # A server that stands still takes nothing more.
+            with suppress(Error, TimeoutError, asyncio.TimeoutError):
+                await self._client.flush(1)
         for task in asyncio.all_tasks(self._loop):
             if task is not asyncio.current_task() and not self._client.is_connected:
                 task.cancel()

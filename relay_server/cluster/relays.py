@@ -95,10 +95,13 @@ class RelayDirectory:
         """The live relay of an id."""
         return self._relays.get(relay)
 
-    async def refresh(self) -> None:
-        """Acquire the lease if this relay has none, and read all leases."""
+    async def refresh(self, *, acquire: bool = True) -> None:
+        """Acquire the lease if this relay has none, and read all leases.
+
+        :param acquire: false only to read
+        """
         try:
-            if self._lease is None:
+            if acquire and self._lease is None:
                 await self._acquire()
             leases = await self._bus.leases(LEASES)
         except SwitchboardError as error:

@@ -119,7 +119,7 @@ class Cluster:
     def _has_others(self) -> bool:
         """Whether robots of this relay can connect to another one."""
         group = self.settings.group
-        return any(not (group and each.group == group) for each in self.others())
+        return any(each.compatible and not (group and each.group == group) for each in self.others())
 
     async def start(self, site: Any, tls: Any) -> None:
         """Listen for the other relays, and join them.
@@ -133,9 +133,11 @@ class Cluster:
         self.port = self._port.getHost().port
         self.log.info("other relays connect at {address}", address=self._own().address)
         await self.bus.start()
-        await self.relays.start()
+        # Before the others learn of this one.
+        await self.relays.refresh(acquire=False)
         for relay in self.relays:
             check_compatible(relay)
+        await self.relays.start()
         await self.homes.start()
         self.status.start()
         self.notices.start()
@@ -148,11 +150,13 @@ class Cluster:
             self._taking_over.cancel()
         self.notices.stop()
         self.file_notices.stop()
-        await self.leadership.stop()
-        self.status.stop()
-        self.homes.stop()
-        await self.relays.stop()
-        await self.bus.stop()
-        await self.forwarder.close()
-        if self._port is not None:
-            await maybeDeferred(self._port.stopListening)
+        try:
+            await self.leadership.stop()
+            self.status.stop()
+            self.homes.stop()
+            await self.relays.stop()
+            await self.bus.stop()
+        finally:
+            await self.forwarder.close()
+            if self._port is not None:
+                await maybeDeferred(self._port.stopListening)

@@ -22,7 +22,7 @@ from relay_server.cluster.bus import (
     RequestRefused,
 )
 from relay_server.cluster.nats_bus import NatsBus
-from tests.worlds.nats_servers import NatsServer, nats_cluster
+from tests.worlds.nats_servers import NatsServer, nats_cluster, nats_server
 from tests.worlds.waiting import PATIENCE, eventually
 
 LEASE_SECONDS = 2.0
@@ -294,3 +294,17 @@ async def test_without_servers_everything_is_refused_with_a_reason(tmp_path: Pat
             await work
         assert "secret" not in str(caught.value)
     await bus.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_relay_leaves_a_bus_whose_server_stands_still(tmp_path: Path) -> None:
+    with nats_server(tmp_path) as server:
+        bus = NatsBus(reactor, [server.url])
+        await bus.start()
+        assert bus.connected
+        server.freeze()
+        try:
+            await bus.stop()
+        finally:
+            server.thaw()
+    assert not bus._thread.is_alive()
