@@ -210,7 +210,7 @@ class Announcer:
         for robot in robots:
             name, online = robot["name"], robot["state"] != "offline"
             if online and (self._polls % SERVICES_EVERY == 0 or name not in self._services):
-                self._services[name] = self._api.services(name)
+                self._learn_services(name)
             topics.update(self._describe(robot, online, self._services.get(name, [])))
         self._polls += 1
         self._commands = {
@@ -228,6 +228,13 @@ class Announcer:
             if self._published.get(topic) != payload:
                 self._published[topic] = payload
                 self._client.publish(topic, payload, 1, True)
+
+    def _learn_services(self, robot: str) -> None:
+        """One robot whose services can't be asked for keeps those of before, and holds up no other."""
+        try:
+            self._services[robot] = self._api.services(robot)
+        except RelayError as error:
+            self._log.warn("{robot}: {error}", robot=robot, error=str(error), limited=f"services of {robot}")
 
     def _describe(
         self, robot: dict[str, Any], online: bool, services: list[AnnouncedService]

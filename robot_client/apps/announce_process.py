@@ -6,6 +6,7 @@ import random
 import ssl
 import threading
 import urllib.parse
+from contextlib import suppress
 from typing import Any
 
 import paho.mqtt.client as paho
@@ -54,7 +55,9 @@ def run_announcer(
         except RelayError as error:
             log.warn("{error}", error=str(error))
             pause = max(POLL_SECONDS, min(MAX_RETRY, pause * 2) * random.uniform(0.5, 1.0))  # noqa: S311
-    client.publish(STATUS, "offline", 1, True).wait_for_publish(2)
+    if client.is_connected():
+        with suppress(RuntimeError, ValueError):
+            client.publish(STATUS, "offline", 1, True).wait_for_publish(2)
     client.disconnect()
     client.loop_stop()
 
@@ -72,15 +75,28 @@ def _prepare(
         if settings.certificate:
             context.load_cert_chain(settings.certificate, settings.key or None)
         client.tls_set_context(context)
+    log = Logger("announce")
     client.will_set(STATUS, "offline", 1, True)
 
     def on_connect(_client: Any, _data: Any, _flags: Any, code: Any, _properties: Any) -> None:
-        if not code.is_failure:
+        if code.is_failure:
+            log.error("the MQTT broker refuses the connection: {code}", code=str(code))
+        else:
+            log.info("connected to the MQTT broker at {broker}", broker=settings.broker)
             client.subscribe([(topic, 1) for topic in announcer.command_topics])
             announcer.connected()
+
+    def on_connect_fail(_client: Any, _data: Any) -> None:
+        log.error("the MQTT broker at {broker} can't be reached", broker=settings.broker, limited="broker")
+
+    def on_disconnect(_client: Any, _data: Any, _flags: Any, code: Any, _properties: Any) -> None:
+        if code.is_failure:
+            log.warn("the connection to the MQTT broker was lost: {code}", code=str(code), limited="lost")
 
     def on_message(_client: Any, _data: Any, message: Any) -> None:
         announcer.received(message.topic, message.payload[:64].decode("utf-8", "replace"), message.retain)
 
     client.on_connect = on_connect
+    client.on_connect_fail = on_connect_fail
+    client.on_disconnect = on_disconnect
     client.on_message = on_message

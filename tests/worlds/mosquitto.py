@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.worlds.processes import Process
@@ -28,9 +29,10 @@ class Mosquitto:
     """The broker's process; all clients need :data:`USER` and :data:`PASSWORD`.
 
     :param certificate: PEM file with key and certificate, for a second port with TLS
+    :param rules: lines of its access control file; without it everything is allowed
     """
 
-    def __init__(self, folder: Path, certificate: Path | None = None) -> None:
+    def __init__(self, folder: Path, certificate: Path | None = None, *, rules: Sequence[str] = ()) -> None:
         self.folder = folder
         self.port, self._tls_port = _free_ports()
         folder.mkdir(parents=True, exist_ok=True)
@@ -48,6 +50,11 @@ class Mosquitto:
             # Started by root it would become another user, who cannot read the password file.
             *(["user root"] if os.getuid() == 0 else []),
         ]
+        if rules:
+            access = folder / "rules"
+            access.write_text("\n".join([f"user {USER}", *rules]) + "\n")
+            access.chmod(0o600)
+            lines.append(f"acl_file {access}")
         if certificate is not None:
             lines += [
                 f"listener {self._tls_port} 127.0.0.1",

@@ -65,6 +65,9 @@ class BrokerListener(Protocol):
     def on_lost(self, reason: str) -> None:
         """The connection was lost, or could not be made."""
 
+    def on_refused(self, what: str) -> None:
+        """The broker refuses a command or a subscription, which its rules do not allow."""
+
     def on_waiting(self) -> None:
         """Messages wait in :meth:`BrokerPort.take`."""
 
@@ -300,6 +303,11 @@ class PahoBroker:
             self._log.info("connected to the MQTT broker at {address}", address=self._settings.broker)
             self.listener.on_connected()
 
+    def refused(self, attempt: _Attempt, what: str) -> None:
+        """The broker refused something."""
+        if attempt is self._attempt:
+            self.listener.on_refused(what)
+
     def lost(self, attempt: _Attempt, reason: str) -> None:
         """The connection ended, or could not be made; try again later."""
         if attempt is not self._attempt:
@@ -339,6 +347,7 @@ class _Attempt:
         client.on_disconnect = self._on_disconnect
         client.on_message = self._on_message
         client.on_publish = self._on_publish
+        client.on_subscribe = self._on_subscribe
         client.on_unsubscribe = self._on_unsubscribe
 
     def start(self) -> None:
@@ -427,8 +436,16 @@ class _Attempt:
     def _on_unsubscribe(self, _client: Any, _data: Any, number: int, *_: Any) -> None:
         self._owner.call(self._owner.read, self, number)
 
-    def _on_publish(self, _client: Any, _data: Any, _id: int, _code: Any, _properties: Any) -> None:
+    def _on_publish(self, _client: Any, _data: Any, _id: int, code: Any, _properties: Any) -> None:
         self._confirmed()
+        if code.is_failure:
+            self._owner.call(self._owner.refused, self, f"the broker refuses a command: {code}")
+
+    def _on_subscribe(self, _client: Any, _data: Any, _id: int, codes: Any, _properties: Any) -> None:
+        refused = [each for each in codes if each.is_failure]
+        if refused:
+            words = f"the broker refuses {len(refused)} of {len(codes)} subscriptions: {refused[0]}"
+            self._owner.call(self._owner.refused, self, words)
 
 
 def _words(error: Exception) -> str:

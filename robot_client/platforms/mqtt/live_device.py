@@ -45,8 +45,8 @@ class LiveDevice:
         """Whether any part of the device is there; a device that never said so is there if it has no such topics."""
         return not self._parts or any(self._part_available(each) for each in self._parts)
 
-    def availability_message(self, topic: str, payload: bytes) -> None:
-        """Take a message; topics that are not about availability are ignored.
+    def availability_message(self, topic: str, payload: bytes) -> bool:
+        """Take a message; whether the topic is about availability.
 
         :raises Invalid: it can't be read
         """
@@ -55,6 +55,7 @@ class LiveDevice:
             if value is not None:
                 self._received += 1
                 self._values[source] = self._received, value
+        return topic in self._sources
 
     def forget_availability(self) -> None:
         """Forget what was said: a broker that restarts may not know the device yet."""

@@ -52,6 +52,7 @@ from robot_client.platforms.mqtt.live_device import LiveDevice, NamedElement
 from robot_client.platforms.mqtt.messages import BOOL, TEXT, TRIGGER
 from robot_client.platforms.mqtt.model import DeviceCall, StateCommand
 from robot_client.platforms.mqtt.settings import MqttSettings
+from robot_client.platforms.mqtt.templates import MissingValue
 
 DEVICES_AT_ONCE = 50
 """Devices that are built in one turn."""
@@ -233,6 +234,7 @@ class MqttPlatform(Platform):
     def on_connected(self) -> None:
         """Subscribe to discovery, and to what is known already."""
         self._connected = True
+        self._problems.set("broker", [])
         self._outage.update("", "the MQTT broker is connected again")
         settings = self._settings
         topics = list(self._routes)
@@ -255,6 +257,11 @@ class MqttPlatform(Platform):
         for live in self._live.values():
             live.forget_availability()
         self._update_available()
+
+    def on_refused(self, what: str) -> None:
+        """Say that the broker refuses something, until the next connection."""
+        self._problems.set("broker", [what])
+        self._publish_problems()
 
     def on_waiting(self) -> None:
         """Read messages, in turns."""
@@ -302,7 +309,8 @@ class MqttPlatform(Platform):
     def _handle_state(self, live: LiveDevice, message: MqttMessage) -> Iterator[None]:
         topic, payload = message
         try:
-            live.availability_message(topic, payload)
+            if live.availability_message(topic, payload):
+                self._problems.set(live.device.available_topic, [])
         except Invalid as error:
             self._problems.set(live.device.available_topic, [str(error)])
         self._set_available(live)
@@ -315,6 +323,9 @@ class MqttPlatform(Platform):
         assert element.source is not None
         try:
             value = element.source.value(payload)
+        except MissingValue:
+            # Devices publish some of their values at a time.
+            return
         except Invalid as error:
             self._problems.set(named.topic, [str(error)])
             return

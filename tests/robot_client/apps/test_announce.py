@@ -33,11 +33,14 @@ class MemoryApi:
         self.offered = [AnnouncedService("/dock/start", TRIGGER), AnnouncedService("/lamp", SET_BOOL)]
         self.done: list[tuple[Any, ...]] = []
         self.error = ""
+        self.broken = ""
 
     def robots(self) -> list[dict[str, Any]]:
         return self.listed
 
     def services(self, robot: str) -> list[AnnouncedService]:
+        if robot == self.broken:
+            raise RelayError("the robot does not answer")
         return self.offered
 
     def stop(self, robot: str) -> None:
@@ -97,6 +100,14 @@ class AnnouncedWorld:
 @pytest.fixture
 def world() -> AnnouncedWorld:
     return AnnouncedWorld()
+
+
+def test_a_robot_whose_services_are_not_known_holds_up_no_other(world: AnnouncedWorld) -> None:
+    world.api.listed = [robot("broken"), robot("new")]
+    world.api.broken = "broken"
+    world.announcer.poll()
+    assert world.retained["homeassistant/device/switchboard_new/config"]
+    assert "service_" not in world.retained["homeassistant/device/switchboard_broken/config"]
 
 
 def test_robot_is_a_device_of_home_assistant(world: AnnouncedWorld) -> None:

@@ -84,6 +84,9 @@ class Connected:
     def on_lost(self, reason: str) -> None:
         self.events.append(reason)
 
+    def on_refused(self, what: str) -> None:
+        self.events.append(what)
+
     def on_waiting(self) -> None:
         while (message := self.broker.take()) is not None:
             self.messages.append(message)
@@ -198,6 +201,19 @@ def test_a_connection_on_which_the_broker_reads_no_command_is_cut(mosquitto: Mos
     for each in (client, direct):
         each.broker.stop()
     proxy.close()
+
+
+def test_what_the_rules_of_the_broker_refuse_is_reported(tmp_path: Path) -> None:
+    broker = Mosquitto(tmp_path / "strict", rules=["topic readwrite allowed/#"])
+    client = Connected(broker=broker.address)
+    assert client.next() == "connected"
+    client.broker.publish("forbidden", "x", 1)
+    assert client.next() == "the broker refuses a command: Not authorized"
+    client.broker.publish("allowed/x", "x", 1)
+    client.reactor.until(lambda: not client.reactor.timers)
+    assert client.events == []
+    client.broker.stop()
+    broker.stop()
 
 
 def test_too_many_commands_are_refused(mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -336,6 +336,26 @@ def test_a_stop_reaches_the_covers_behind_one_that_can_not_be_sent(
     assert sent == ["a/set", "c/set"]
 
 
+def test_what_the_broker_refuses_is_a_problem_until_the_next_connection(world: GatewayWorld) -> None:
+    world.broker.listener.on_refused("the broker refuses a command: Not authorized")
+    assert "Not authorized" in world.problems()
+    world.broker.lose()
+    world.broker.connect()
+    assert "Not authorized" not in world.problems()
+
+
+def test_a_message_without_the_value_of_an_element_is_no_problem(world: GatewayWorld) -> None:
+    """Devices publish some of their values at a time."""
+    world.discover("sensor", {"name": "b", "uniq_id": "b", "stat_t": "zig", "val_tpl": "{{ value_json.battery }}",
+                              "unit_of_meas": "%", "dev": {"ids": ["zig"], "name": "Zig"}})  # fmt: skip
+    world.broker.send("zig", '{"battery": 50}')
+    world.settle()
+    world.broker.send("zig", '{"linkquality": 7}')
+    world.settle()
+    assert world.value("/zig/e", NUMBER) == 50
+    assert "zig" not in world.problems()
+
+
 def test_state_that_can_not_be_read_is_a_problem_until_one_can(world: GatewayWorld) -> None:
     world.discover("light", LAMP)
     for bad in (b"maybe", b"\xff\xff", b"x" * 70_000):
