@@ -38,6 +38,7 @@ DOWN_SECONDS = 2.0
 """For as long a part is gone."""
 
 PERIOD = 0.1
+LET_GO_SECONDS = 1.0
 ANSWER_SECONDS = 5.0
 LATE_SECONDS = 0.5
 """A call that the robot executes so long after its driver was told of the end is late."""
@@ -150,7 +151,8 @@ class Driver(threading.Thread):
                     self.calls.append((began, time.monotonic(), "cut"))
                     raise
                 self.calls.append((began, time.monotonic(), said))
-                time.sleep(PERIOD)
+                # Who is refused must let go first: commands that go on never take control.
+                time.sleep(LET_GO_SECONDS if said.startswith("refused") else PERIOD)
 
     def _answer(self, socket: Any, number: str, until: float) -> str:
         while (left := until - time.monotonic()) > 0:
