@@ -244,17 +244,23 @@ class Forwarder:
 
     async def _watch(self, relay: RelayInfo) -> None:
         """Return when a relay does not answer a short request in time."""
-        while True:
+        answers = True
+        while answers:
             await sleep(self._reactor, WATCH_SECONDS)
-            fields = Headers({CLUSTER_HEADER: [self._settings.secret]})
-            asking = self._agent.request(b"GET", f"http://{relay.address}{ANYTHING}".encode(), fields)
-            asking.addTimeout(WATCH_SECONDS, self._reactor)
-            try:
-                await readBody(await asking)
-            except CancelledError:
-                raise
-            except Exception:
-                return
+            answers = await self.answers(relay)
+
+    async def answers(self, relay: RelayInfo) -> bool:
+        """Whether a relay answers a short request within :data:`WATCH_SECONDS`."""
+        fields = Headers({CLUSTER_HEADER: [self._settings.secret]})
+        asking = self._agent.request(b"GET", f"http://{relay.address}{ANYTHING}".encode(), fields)
+        asking.addTimeout(WATCH_SECONDS, self._reactor)
+        try:
+            await readBody(await asking)
+        except CancelledError:
+            raise
+        except Exception:
+            return False
+        return True
 
     async def ask_all(
         self, method: str, path: str, body: bytes, relays: Sequence[RelayInfo], client: ForwardedClient

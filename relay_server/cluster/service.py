@@ -13,6 +13,7 @@ from twisted.python.failure import Failure
 
 from relay_server import VERSION
 from relay_server.cluster.change_notices import ChangeNotices
+from relay_server.cluster.departed import DepartedRelays
 from relay_server.cluster.drain import Drain
 from relay_server.cluster.file_notices import FileNotices
 from relay_server.cluster.forwarding import Forwarder
@@ -62,6 +63,7 @@ class Cluster:
         self.homes = ClusterHomes(reactor, database, robots, self.bus, self.relays, self.id)
         self.homes.on_home = lambda robot_id, relay: self.forwarder.robot_moved(robot_id, relay)
         self.relays.on_change = self._relays_changed
+        self._departed = DepartedRelays(lambda relay: self.forwarder.answers(relay))
         self.leadership = Leadership(reactor, database, self.id)
         self.take_over: Callable[[Collection[str]], Awaitable[None]] = lambda live: succeed(None)
         """Goes on with what no live relay works on, of the ids of live relays."""
@@ -97,6 +99,7 @@ class Cluster:
 
     def _relays_changed(self) -> None:
         self.homes.relays_changed()
+        self._departed.note(self.others())
         if self._taking_over is None:
             self._taking_over = self._reactor.callLater(GONE_SECONDS, self._take_over)
 
@@ -106,7 +109,11 @@ class Cluster:
         Deferred.fromCoroutine(self._take_over_of(live)).addErrback(self._not_taken_over)
 
     async def _take_over_of(self, live: Collection[str]) -> None:
-        await self.take_over(live)
+        # A relay that has lost the bus alone has no lease, and goes on.
+        alive = await self._departed.alive([*self.relays, self._own()])
+        await self.take_over({*live, *alive})
+        if alive and self._taking_over is None:
+            self._taking_over = self._reactor.callLater(GONE_SECONDS, self._take_over)
 
     def _not_taken_over(self, failure: Failure) -> None:
         self.log.info("jobs of relays that are gone stay for now: {reason}", reason=failure.value)

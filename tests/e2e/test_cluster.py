@@ -21,6 +21,7 @@ from relay_protocol import PROTOCOL_VERSION, link
 from relay_server.auth.account_limit import FAILURES_OF_ACCOUNT
 from relay_server.cli.admin_socket_client import send_order
 from relay_server.cli.app import os_user
+from relay_server.cluster.forwarding import ANYTHING
 from relay_server.icpi.messages import IcpiMessage, parse, write
 from tests.worlds.nats_servers import NatsServer, nats_server
 from tests.worlds.postgresql_server import postgresql_database
@@ -486,6 +487,9 @@ def test_each_relay_shows_all_relays(fleet: Fleet) -> None:
 def test_the_port_for_relays_serves_only_relays(fleet: Fleet) -> None:
     assert "the bus is connected" in fleet.first.log
     port = int(fleet.first.log.rpartition("other relays connect at 127.0.0.1:")[2].split()[0])
+    # Other relays ask this whether it still answers anything.
+    alive = httpx.get(f"http://127.0.0.1:{port}{ANYTHING}", headers={"Switchboard-Cluster": SECRET})
+    assert alive.status_code < 500, alive.text
     for headers in (
         {},
         {"Switchboard-Cluster": "x" * 32},
