@@ -446,3 +446,18 @@ def test_a_pipe_between_roles_runs_while_all_of_them_are_started(world: World) -
     assert (part()["state"], mapped_pipes(world)) == ("waiting", [])
     for role in (OTHER, TURN):
         order(role, "stop")
+
+
+def test_a_role_may_name_robots_with_their_realm(world: World) -> None:
+    """Its user's account in that realm is who has the right; here it is the user itself."""
+    ann, name = world.clients["ann"], "Thermometer-Full-Names"
+    text = TURN_DOCUMENT.replace(TURN, name).replace(
+        'fierro:Turn fierro:process fierro:Beeper . fierro:Beeper switchboard:resource "robots/rover/services/beep" .',
+        "fierro:Turn fierro:port fierro:HEAT . fierro:HEAT fierro:mapping fierro:TURN ; "
+        'switchboard:resource "robots/pad%40default/topics/temperature#/data" .',
+    )
+    ann.put(f"/roles/{name}", content=text, headers={"Content-Type": "text/turtle"}).raise_for_status()
+    started = ann.post(f"/roles/{name}/run/start").raise_for_status().json()
+    assert ([each["element"] for each in started["parts"]], started["why"]) == (["HEAT → TURN"], "")
+    wait_for("the pipe runs", lambda: ann.get(f"/roles/{name}/run").json()["state"] == "running")
+    assert ann.post(f"/roles/{name}/run/stop").json()["state"] == "stopped"
