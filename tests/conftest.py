@@ -35,6 +35,10 @@ SECONDS = Path(__file__).with_name("seconds.txt")
 
 def pytest_configure(config: pytest.Config) -> None:
     gc.disable()
+    if config.getoption("--other-relay"):
+        from tests.worlds.other_relay import install
+
+        install()
     processor = ProcessorSeconds(config)
     config.pluginmanager.register(processor)
     config.pluginmanager.register(TimeLimit(TEST_SECONDS))
@@ -54,6 +58,9 @@ REAL_PARTS = re.compile(
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--quick", action="store_true", help="only files that need no ROS, browser or process")
+    parser.addoption(
+        "--other-relay", action="store_true", help="clients connect to another relay than robots"
+    )
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -301,8 +301,12 @@ class RoleRuns:
         :raises NotFound: there is no such Role that the user may see
         """
         elements = await self._roles.elements(principal, role)
-        bindings = [binding_of(resource) for each in elements for resource in each.resources]
-        robots = {each.robot for each in bindings if each is not None and each.robot}
+        others = await self._roles.resources_elsewhere(principal, role, unbound(elements))
+        resources = [resource for each in elements for resource in each.resources]
+        resources += [each for roles in others.values() for found in roles.values() for each in found]
+        bindings = map(binding_of, resources)
+        own = f"@{principal.realm}"
+        robots = {each.robot.removesuffix(own) for each in bindings if each is not None and each.robot}
         relays = [await relay_of_robot(each) for each in sorted(robots)]
         return relays[0] if relays and all(each == relays[0] for each in relays) else None
 
