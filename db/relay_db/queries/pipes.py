@@ -18,7 +18,7 @@ from relay_protocol.realms import full_name
 MAX_PIPES = 1000
 """Most pipes of one realm."""
 
-MAX_PIPES_OF_USER = 500
+MAX_PIPES_OF_USER = 750
 
 
 class NewPipeRow(NamedTuple):
