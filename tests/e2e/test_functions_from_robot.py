@@ -20,13 +20,16 @@ from twisted.internet.threads import deferToThread
 from relay_protocol.errors import Unavailable
 from relay_protocol.functions import CallFailed, function
 from robot_client.offload import Cloud, Device, DeviceState, decisions, offload
+from robot_client.offload.decisions import Offloaded
 from robot_client.offload.deferred import DeferredCloud
 from robot_client.offload.device import publish
 from robot_client.offload.function_link import Overtaken
-from robot_client.services.placement import CameraImage, RunOptions, file_of, marker_function
+from robot_client.services.faces import FaceFinder
+from robot_client.services.placement import CameraImage, RunOptions, face_function, file_of, marker_function
 from tests.robot_client.services.test_markers import LENS, SIZE, drawn
 from tests.worlds import offload_functions
 from tests.worlds.chaos_proxy import ChaosProxy
+from tests.worlds.face_images import EILEEN, scene
 from tests.worlds.file_daemon import PRESSURE, file_daemon
 from tests.worlds.forked_programs import run_command
 from tests.worlds.http_requests import ask
@@ -219,21 +222,30 @@ def test_without_the_relay_a_function_runs_here(world: RobotProgram, tmp_path: P
         elsewhere.call("add", a=1)
 
 
-def test_the_service_markers_searches_on_a_worker_and_here_once_the_link_is_cut(world: RobotProgram) -> None:
-    find = marker_function("4X4_50", SIZE, RunOptions("auto", world.cloud, world.device))
-    picture = CameraImage(drawn(7, (0.2, 0.1, 1.5), 0.4))
+@pytest.mark.parametrize("service", ["markers", "faces"])
+def test_a_service_searches_on_a_worker_and_here_once_the_link_is_cut(
+    world: RobotProgram, service: str
+) -> None:
+    run = RunOptions("auto", world.cloud, world.device)
+    find: Offloaded[..., list[Any]]
+    if service == "markers":
+        find, picture = marker_function("4X4_50", SIZE, run), CameraImage(drawn(7, (0.2, 0.1, 1.5), 0.4))
+        arguments: tuple[Any, ...] = (picture, LENS)
+    else:
+        find, picture = face_function(FaceFinder(), run), CameraImage(scene(EILEEN, 0.8, (50, 20)))
+        arguments = (picture,)
     world.publish(cpu=False)
-    here = find(picture, LENS)
-    assert [each.number for each in here] == [7]
+    here = find(*arguments)
+    assert len(here) == 1
     world.publish(cpu=True)
 
     def ran_away() -> bool:
-        found = find(picture, LENS)
+        found = find(*arguments)
         assert found == here
         return find.ran_away
 
     # The first call may take longer than a service waits, while the worker imports OpenCV.
-    world.cloud.call("detect_markers", timeout=60, image=file_of(picture))
+    world.cloud.call(f"detect_{service}", timeout=60, image=file_of(picture))
     wait_for("it runs on a worker", ran_away)
     world.proxy.black_hole()
     assert not ran_away()
