@@ -17,7 +17,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error, NoRespondersError
-from nats.js.errors import KeyNotFoundError, KeyWrongLastSequenceError, NotFoundError
+from nats.js.errors import APIError, KeyNotFoundError, KeyWrongLastSequenceError, NotFoundError
 from nats.js.kv import KeyValue
 from nats.js.manager import JetStreamManager
 from twisted.internet.defer import CancelledError, Deferred
@@ -44,6 +44,8 @@ from relay_server.cluster.bus import (
 T = TypeVar("T")
 
 BUCKET = "switchboard_leases"
+REPLICAS = 3
+"""Servers that store each lease, where there are so many."""
 PREFIX = "sb."
 """Begins all subjects, so that other users of the servers are not disturbed."""
 REFUSED = "Switchboard-Refused"
@@ -64,14 +66,18 @@ class NatsBus:
     """A :class:`~relay_server.cluster.bus.ClusterBus` over NATS.
 
     :param servers: addresses, ``nats://[user:password@]host:port`` or ``tls://…``
-    :param replicas: servers that store each lease: 1 for a single server, 3 for a cluster
+    :param replicas: servers that store each lease; ``None``: 3 if that many servers are known, else 1
     :param lease_seconds: until the lease of a dead relay ends
     """
 
     log = Logger()
 
     def __init__(
-        self, reactor: Any, servers: Sequence[str], replicas: int = 1, lease_seconds: float = LEASE_SECONDS
+        self,
+        reactor: Any,
+        servers: Sequence[str],
+        replicas: int | None = None,
+        lease_seconds: float = LEASE_SECONDS,
     ) -> None:
         self.connected = False
         self._reactor = reactor
@@ -319,12 +325,37 @@ class NatsBus:
 
     async def _open_bucket(self) -> KeyValue:
         stream = self._client.jetstream(timeout=WRITE_SECONDS)
+        # Also those that the first one has named: often only the name of the cluster is given.
+        known = REPLICAS if len(self._client.servers) >= REPLICAS else 1
+        wanted = self._replicas or known
         try:
-            return await stream.key_value(BUCKET)
+            bucket = await stream.key_value(BUCKET)
         except NotFoundError:
-            return await stream.create_key_value(
-                bucket=BUCKET, ttl=self._lease_seconds, replicas=self._replicas, max_value_size=4096
-            )
+            return await self._new_bucket(stream, wanted)
+        await self._add_copies(stream, wanted)
+        return bucket
+
+    async def _new_bucket(self, stream: Any, replicas: int) -> KeyValue:
+        settings = {"bucket": BUCKET, "ttl": self._lease_seconds, "max_value_size": 4096}
+        try:
+            bucket: KeyValue = await stream.create_key_value(replicas=replicas, **settings)
+        except APIError as error:
+            if replicas == 1 or self._replicas is not None:
+                raise
+            self.log.warn("leases are stored by one server of the bus: {reason}", reason=str(error))
+            bucket = await stream.create_key_value(replicas=1, **settings)
+        return bucket
+
+    async def _add_copies(self, stream: Any, replicas: int) -> None:
+        """Have more servers store the leases than when they were first stored."""
+        config = (await stream.stream_info(f"KV_{BUCKET}")).config
+        if (config.num_replicas or 1) >= replicas:
+            return
+        config.num_replicas = replicas
+        try:
+            await stream.update_stream(config)
+        except APIError as error:
+            self.log.warn("leases are stored by one server of the bus: {reason}", reason=str(error))
 
 
 @dataclass

@@ -35,8 +35,6 @@ from relay_server.robots.registry import RobotRegistry
 
 GONE_SECONDS = 20.0
 """Seconds after a change of relays until the work of those that are gone is taken over; a lost lease may come back."""
-REPLICAS = 3
-"""Servers that store each lease, if there are so many."""
 
 
 class Cluster:
@@ -57,8 +55,7 @@ class Cluster:
         self.settings = settings
         self.id = secrets.token_hex(8)
         self._started = time.time()
-        replicas = REPLICAS if len(settings.bus) >= REPLICAS else 1
-        self.bus = NatsBus(reactor, settings.bus, replicas)
+        self.bus = NatsBus(reactor, settings.bus)
         self.relays = RelayDirectory(reactor, self.bus, self._own)
         self.homes = ClusterHomes(reactor, database, robots, self.bus, self.relays, self.id)
         self.homes.on_home = lambda robot_id, relay: self.forwarder.robot_moved(robot_id, relay)

@@ -21,7 +21,7 @@ from relay_server.cluster.bus import (
     NoResponder,
     RequestRefused,
 )
-from relay_server.cluster.nats_bus import NatsBus
+from relay_server.cluster.nats_bus import BUCKET, NatsBus
 from tests.worlds.nats_servers import NatsServer, nats_cluster, nats_server
 from tests.worlds.waiting import PATIENCE, eventually
 
@@ -308,3 +308,20 @@ async def test_a_relay_leaves_a_bus_whose_server_stands_still(tmp_path: Path) ->
         finally:
             server.thaw()
     assert not bus._thread.is_alive()
+
+
+@pytest_twisted.ensureDeferred
+async def test_leases_are_stored_by_three_servers_also_if_one_address_is_given(
+    servers: list[NatsServer],
+) -> None:
+    """Those that were stored by one before get more copies."""
+    single = NatsBus(reactor, [servers[0].url], replicas=1)
+    await single.start()
+    await (await single.lease("one", b"1")).release()
+    await single.stop()
+    bus = NatsBus(reactor, [servers[0].url])
+    await bus.start()
+    await (await bus.lease("two", b"2")).release()
+    info = await bus._deferred(bus._client.jetstream().stream_info(f"KV_{BUCKET}"))
+    assert info.config.num_replicas == 3
+    await bus.stop()
