@@ -27,6 +27,9 @@ from relay_server.common.database import AsyncDatabase
 from relay_server.robots.registry import ControlLinkPort, RobotRegistry, RobotState
 
 SUBJECT = "homes"
+REGISTER_SECONDS = 10.0
+"""Seconds in which a robot is registered, after this relay was recorded as its home: its stored stop is read first."""
+
 READ_SECONDS = 2.0
 """Seconds between reads of the homes of all robots, for notices that were lost."""
 
@@ -111,6 +114,9 @@ class ClusterHomes:
         self._homes: dict[int, HomeRelayRecord] = {}
         self._connecting: Counter[int] = Counter()
         """Robots that are about to be registered here, by the number of their connections."""
+        self._recorded: dict[int, float] = {}
+        """When this relay was last recorded as the home of a robot that has not disconnected since."""
+        self._seconds = reactor.seconds
         self._closed: WeakSet[ControlLinkPort] = WeakSet()
         """Links that were closed because their robots have newer ones elsewhere."""
         self.on_moved: Callable[[RobotState], object] = lambda robot: None
@@ -153,10 +159,12 @@ class ClusterHomes:
         known = self._homes.get(robot.robot_id)
         if known is not None and known.epoch > epoch:
             raise Unavailable("the robot has connected to another relay meanwhile")
+        self._recorded[robot.robot_id] = self._seconds()
         self._announce(HomeNotice(robot.robot_id, self._own, epoch, address))
 
     def disconnected(self, robot: RobotState) -> None:
         """See :meth:`RobotHomes.disconnected`."""
+        self._recorded.pop(robot.robot_id, None)
         home = self._homes.get(robot.robot_id)
         if home is None or home.relay != self._own:
             return
@@ -271,8 +279,14 @@ class ClusterHomes:
         return robot is not None and robot.control_link is not None and robot.control_link not in self._closed
 
     def _is_here(self, robot_id: int) -> bool:
+        """Whether a robot is registered here, or is about to be."""
         robot = self._robots.find(robot_id)
-        return bool(self._connecting[robot_id]) or (robot is not None and robot.control_link is not None)
+        recorded = self._recorded.get(robot_id)
+        return (
+            bool(self._connecting[robot_id])
+            or (robot is not None and robot.control_link is not None)
+            or (recorded is not None and self._seconds() - recorded < REGISTER_SECONDS)
+        )
 
     def _update(self) -> Deferred[None]:
         return Deferred.fromCoroutine(self._read()).addErrback(self._not_read)

@@ -164,3 +164,16 @@ def test_a_robot_that_has_gone_is_not_taken_from_the_relay_that_it_is_connected_
     assert elsewhere is not None and elsewhere.id == "one"
     for each in (first, second):
         each.homes.stop()
+
+
+def test_a_robot_keeps_its_home_while_it_is_being_registered() -> None:
+    """Its stored stop is read after the home was recorded. One that is never registered is given up later."""
+    clock, database = Clock(), FakeDatabase()
+    member = Member("one", clock, database, LocalBus(clock))
+    Deferred.fromCoroutine(member.homes.connecting(member.robot, "192.0.2.1"))
+    clock.advance(READ_SECONDS)
+    assert database.homes[1] == HomeRelayRecord(1, "one", 1)
+    for _ in range(5):
+        clock.advance(READ_SECONDS)
+    assert database.homes[1] == HomeRelayRecord(1, "", 1)
+    member.homes.stop()
