@@ -67,7 +67,7 @@ class Device:
             found = getattr(vision, name)(**arguments)
             return found, time.perf_counter() - began
         request = CallFunction(function=name, arguments=encode_value(arguments), deadline=DEADLINE)
-        reply = _wait(self.cloud._begin(request).future, DEADLINE, name)
+        reply = _wait(self.cloud._begin(request, DEADLINE).future, DEADLINE, name)
         return result_of(reply), reply.seconds
 
     def once(self, where: str, name: str, count: int) -> dict[str, Any]:
