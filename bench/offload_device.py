@@ -97,18 +97,20 @@ class Device:
         return {"added": added}
 
     def follow(self, where: str, seconds: float, hertz: float) -> dict[str, Any]:
-        """Find the face in each frame of a camera, and follow it from the frame before.
+        """Find the face in the newest frame of a camera, and follow it from the frame before.
 
-        The share of the processor is that at the full rate, also where a busy machine has slowed it down.
+        Frames that come while it is at work are left out. The processor's milliseconds are those for each frame
+        that was taken.
         """
-        began, used, number = time.monotonic(), time.process_time(), 0
+        began, used, taken, number = time.monotonic(), time.process_time(), 0, 0
         while (due := began + number / hertz) < began + seconds:
             time.sleep(max(0.0, due - time.monotonic()))
             self.run(where, "detect_faces", **self.arguments("detect_faces", number))
             self.run(where, "track_face", **self.arguments("track_face", number))
-            number += 1
-        percent = 100 * hertz * (time.process_time() - used) / number
-        return {"percent": percent, "hertz": number / (time.monotonic() - began)}
+            taken += 1
+            number = max(number + 1, int((time.monotonic() - began) * hertz))
+        ms = (time.process_time() - used) * 1000 / taken
+        return {"ms": ms, "hertz": taken / (time.monotonic() - began)}
 
     def analyse(self, where: str, count: int) -> dict[str, Any]:
         """Analyse so many frames at once."""

@@ -10,17 +10,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
-
 from relay_protocol import link
 from robot_client.alerts import AlertCondition, OnAlert
 from robot_client.device_state.readings import DeviceReadings
 from robot_client.device_state.rules import DISK, MEMORY, RULES, CriticalComponents
 from robot_client.device_state.settings import DeviceSettings
-
-STATE_FILE = "device.json"
-"""In the daemon's state folder: ``at`` (Unix seconds), ``critical`` and ``readings`` by component, and ``where`` of the
-settings."""
+from robot_client.offload.device import STATE_FILE, DeviceState, publish
 
 DEVICE = "device"
 """Kind of alerts about the device."""
@@ -100,18 +95,11 @@ class DeviceManager:
         condition.update(text, f"{component} is not critical any more")
 
     def _write_state(self, state: link.DeviceReport) -> None:
-        text = msgspec.json.encode(
-            {
-                "at": state.at,
-                "critical": state.critical,
-                "readings": state.readings,
-                "where": self._where,
-            }
+        published = DeviceState(
+            at=state.at, critical=state.critical, readings=state.readings, where=self._where
         )
-        pending = self._folder / f"{STATE_FILE}.pending"
         try:
-            pending.write_bytes(text)
-            pending.replace(self._folder / STATE_FILE)
+            publish(self._folder, published)
         except OSError as error:
             self._unwritable.update(
                 f"the daemon can't write into its state folder {self._folder}: {error.strerror}", ""

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from robot_client.device_state.settings import DeviceSettings
+from robot_client.offload.device import WIRELESS
 
-SIGNAL = "signal"
-QUALITY = "quality"
+SIGNAL, QUALITY = WIRELESS
 BATTERY = "battery"
 CPU = "cpu"
 MEMORY = "memory"
@@ -40,9 +40,6 @@ RULES = {
     TEMPERATURE: Rule(False, "°C"),
 }
 """The components, in the order in which they are checked."""
-
-WIRELESS = (SIGNAL, QUALITY)
-"""Components of which a critical one means that the network can't help."""
 
 
 class CriticalComponents:
