@@ -269,7 +269,7 @@ def _fleet(
 def _order_forwarding(core: Core) -> OrderForwarding:
     if core.cluster is None:
         return NoOrderForwarding()
-    return ClusterOrders(core.homes, core.cluster.forwarder)
+    return ClusterOrders(core.reactor, core.homes, core.cluster.forwarder)
 
 
 def _foxglove_urls(core: Core, changes: ChangeWatcher, sessions: SessionManager) -> FoxgloveUrlService:

@@ -1,11 +1,13 @@
-"""Orders to many robots, for those whose home is another relay: each is sent there as an order to one robot."""
+"""Orders to many robots, for those whose home is another relay: each such relay gets one order for its robots."""
 
 from __future__ import annotations
 
 from typing import Any, Protocol
 
 import msgspec
-from twisted.internet.defer import DeferredSemaphore
+from twisted.internet.defer import Deferred, DeferredSemaphore
+from twisted.python.failure import Failure
+from twisted.web.http import OK
 
 from relay_db.queries import RobotRecord
 from relay_protocol import jsontext
@@ -20,6 +22,8 @@ PATH = "/api/v1/fleet"
 
 AT_ONCE = 64
 """Orders that are sent at a time."""
+MOST_ROBOTS = 200
+"""Robots of an order that is sent."""
 
 
 class OrderForwarding(Protocol):
@@ -46,13 +50,86 @@ class NoOrderForwarding:
         return None
 
 
-class ClusterOrders:
-    """See :class:`OrderForwarding`. Orders go without their age, so the home refuses those that need one."""
+class _OrderToHome:
+    """An order for robots of one relay, and who waits for their outcomes.
 
-    def __init__(self, homes: RobotHomes, forwarder: Forwarder) -> None:
+    :param order: with all its robots
+    """
+
+    def __init__(self, relay: RelayInfo, order: Order, client: ForwardedClient) -> None:
+        self.relay = relay
+        self.order = order
+        self.client = client
+        self.sending: Deferred[None] | None = None
+        self._waiting: dict[str, Deferred[TaskOutcome]] = {}
+
+    @property
+    def robots(self) -> list[str]:
+        """Robots without an outcome."""
+        return list(self._waiting)
+
+    def outcome(self, robot: str) -> Deferred[TaskOutcome]:
+        """The outcome of a robot. When all who wait have cancelled, the order ends."""
+        waiting = self._waiting[robot] = Deferred(lambda _: self._left(robot))
+        return waiting
+
+    def answered(self, line: bytes) -> None:
+        """A line of the home's answer."""
+        found = _object(line)
+        robot = found.get("robot")
+        waiting = self._waiting.pop(robot, None) if isinstance(robot, str) and "ok" in found else None
+        if waiting is not None:
+            waiting.callback(
+                TaskOutcome(
+                    bool(found["ok"]),
+                    str(found.get("message", "")),
+                    found.get("values"),
+                    bool(found.get("pending")),
+                )
+            )
+
+    def ended(self, status: int, answer: bytes) -> None:
+        """The answer is complete.
+
+        :param answer: its body, unless the status is 200
+        """
+        refusal = _object(answer).get("detail") if status != OK else None
+        for robot in self.robots:
+            waiting = self._waiting.pop(robot)
+            if isinstance(refusal, str):
+                waiting.callback(TaskOutcome(False, refusal))
+            else:
+                where = self.relay.address
+                waiting.errback(
+                    Unavailable(f"the relay that the robot is connected to gave no result ({where})")
+                )
+
+    def failed(self, failure: Failure) -> None:
+        """No answer comes any more."""
+        for robot in self.robots:
+            self._waiting.pop(robot).errback(failure)
+
+    def _left(self, robot: str) -> None:
+        del self._waiting[robot]
+        if not self._waiting and self.sending is not None:
+            self.sending.cancel()
+
+
+class ClusterOrders:
+    """See :class:`OrderForwarding`. Orders go without their age, so the home refuses those that need one.
+
+    Robots of an order whose turn comes at the same time are sent together.
+
+    :param reactor: Twisted's
+    """
+
+    def __init__(self, reactor: Any, homes: RobotHomes, forwarder: Forwarder) -> None:
+        self._reactor = reactor
         self._homes = homes
         self._forwarder = forwarder
         self._turns = DeferredSemaphore(AT_ONCE)
+        self._gathered: dict[tuple[str, ForwardedClient, int], _OrderToHome] = {}
+        """Orders that are sent in a moment, by relay, client and identity of the order."""
 
     async def send(
         self, principal: Principal, address: str, order: Order, robot: RobotRecord
@@ -62,32 +139,30 @@ class ClusterOrders:
         if relay is None:
             return None
         client = ForwardedClient.of(principal, address)
+        key = relay.id, client, id(order)
+        sent = self._gathered.get(key)
+        if sent is None or len(sent.robots) >= MOST_ROBOTS:
+            sent = self._gathered[key] = _OrderToHome(relay, order, client)
+            self._reactor.callLater(0, self._begin, key, sent)
+        return await sent.outcome(robot.name)
+
+    def _begin(self, key: tuple[str, ForwardedClient, int], sent: _OrderToHome) -> None:
+        if self._gathered.get(key) is sent:
+            del self._gathered[key]
+        if sent.robots:
+            sent.sending = Deferred.fromCoroutine(self._send(sent))
+            sent.sending.addErrback(sent.failed)
+
+    async def _send(self, sent: _OrderToHome) -> None:
         await self._turns.acquire()
         try:
-            body = body_of(order, robot.name)
-            status, answer = await self._forwarder.ask("POST", PATH, body, relay, client)
+            body = body_of(sent.order, sent.robots)
+            answer = await self._forwarder.ask_lines(
+                "POST", PATH, body, sent.relay, sent.client, sent.answered
+            )
         finally:
             self._turns.release()
-        return outcome_of(status, answer, relay)
-
-
-def outcome_of(status: int, answer: bytes, relay: RelayInfo) -> TaskOutcome:
-    """The outcome in the home's answer: lines of JSON, or problem details.
-
-    :raises Unavailable: there is none in it
-    """
-    for line in answer.splitlines():
-        found = _object(line)
-        if status == 200 and "ok" in found and "robot" in found:
-            return TaskOutcome(
-                bool(found["ok"]),
-                str(found.get("message", "")),
-                found.get("values"),
-                bool(found.get("pending")),
-            )
-        if status != 200 and isinstance(found.get("detail"), str):
-            return TaskOutcome(False, found["detail"])
-    raise Unavailable(f"the relay that the robot is connected to gave no result ({relay.address})")
+        sent.ended(*answer)
 
 
 def _object(line: bytes) -> dict[str, Any]:

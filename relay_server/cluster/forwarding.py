@@ -204,6 +204,36 @@ class Forwarder:
         :param body: JSON, or empty
         :raises Unavailable: the other relay can't be reached, or is of another version
         """
+        return await self._ask(method, path, body, relay, client, readBody)
+
+    async def ask_lines(
+        self,
+        method: str,
+        path: str,
+        body: bytes,
+        relay: RelayInfo,
+        client: ForwardedClient,
+        on_line: Callable[[bytes], None],
+    ) -> tuple[int, bytes]:
+        """As :meth:`ask`, for an answer in lines; returns the body only if the status is not 200.
+
+        :param on_line: gets each line as soon as it has come
+        """
+
+        def read(response: Any) -> Deferred[bytes]:
+            return _Lines(on_line).read(response) if response.code == OK else readBody(response)
+
+        return await self._ask(method, path, body, relay, client, read)
+
+    async def _ask(
+        self,
+        method: str,
+        path: str,
+        body: bytes,
+        relay: RelayInfo,
+        client: ForwardedClient,
+        read: Callable[[Any], Deferred[bytes]],
+    ) -> tuple[int, bytes]:
         check_compatible(relay)
         fields = Headers({"Content-Type": ["application/json"]})
         for name, value in self.headers(client).items():
@@ -213,7 +243,7 @@ class Forwarder:
             producer = FileBodyProducer(BytesIO(body)) if body else None
             sending = self._agent.request(method.encode(), url, fields, producer)
             response = await self._while_it_answers(relay, sending)
-            return response.code, await self._while_it_answers(relay, readBody(response))
+            return response.code, await self._while_it_answers(relay, read(response))
         except (ConnectError, DNSLookupError, TimeoutError):
             raise unreachable(relay) from None
         except (RequestTransmissionFailed, ResponseFailed, PartialDownloadError):
@@ -414,6 +444,35 @@ class RequestForwarding:
         """
         client = ForwardedClient.of(principal, address, final=True)
         return await self.forwarder.ask_all("GET", path, b"", self._others(), client)
+
+
+class _Lines(TwistedProtocol):
+    """Passes on the lines of an answer's body as they come."""
+
+    transport: Any
+
+    def __init__(self, on_line: Callable[[bytes], None]) -> None:
+        self._on_line = on_line
+        self._rest = b""
+        self._done: Deferred[bytes] = Deferred(lambda _: self.transport.stopProducing())
+
+    def read(self, response: Any) -> Deferred[bytes]:
+        """Fires with nothing when the body is complete, and fails with what has cut it."""
+        response.deliverBody(self)
+        return self._done
+
+    def dataReceived(self, data: bytes) -> None:
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            self._on_line(line)
+
+    def connectionLost(self, reason: Failure = connectionDone) -> None:
+        if self._done.called:
+            return
+        if reason.check(ResponseDone):
+            self._done.callback(b"")
+        else:
+            self._done.errback(reason)
 
 
 class _AnswerPipe(TwistedProtocol):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, NamedTuple, TypedDict
@@ -183,9 +183,9 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.service or self.topic or self.name or f"{self.action} {self.module}".strip()
 
 
-def body_of(order: Order, robot: str) -> bytes:
-    """The body of the same order to one robot."""
-    body: dict[str, Any] = {"robots": [robot], "do": order.do}
+def body_of(order: Order, robots: Sequence[str]) -> bytes:
+    """The body of the same order to some of its robots."""
+    body: dict[str, Any] = {"robots": robots, "do": order.do}
     if order.do != "stop":
         body["timeout"] = order.timeout
     for field in sorted(_FIELDS[order.do]):

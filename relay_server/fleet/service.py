@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -312,7 +312,8 @@ class FleetService:
             else:
                 await begun(self._stop(plan, one, audited=False))
             return
-        with self._order_slot(plan.principal):
+        # The relay that has forwarded an order counts it.
+        with nullcontext() if plan.forwarded else self._order_slot(plan.principal):
             await self._write_audit(plan)
             on_begin()
             await begun(bounded_gather(plan.robots, one))
