@@ -221,7 +221,7 @@ class Forwarder:
         """
 
         def read(response: Any) -> Deferred[bytes]:
-            return _Lines(on_line).read(response) if response.code == OK else readBody(response)
+            return _AnswerLines(on_line).read(response) if response.code == OK else readBody(response)
 
         return await self._ask(method, path, body, relay, client, read)
 
@@ -446,7 +446,7 @@ class RequestForwarding:
         return await self.forwarder.ask_all("GET", path, b"", self._others(), client)
 
 
-class _Lines(TwistedProtocol):
+class _AnswerLines(TwistedProtocol):
     """Passes on the lines of an answer's body as they come."""
 
     transport: Any

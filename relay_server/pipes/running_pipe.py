@@ -240,6 +240,10 @@ class RunningPipe:
         """End both sessions. Control of a robot is released."""
         self.ended = True
         cancel(self._polling)
+        if self.moves:
+            target = self._target.client
+            # A user may start another one at once: it does not continue this one.
+            target.controller.release(target, "the pipe has ended")
         for port in (self._target, self._source):
             port.on_close = _nothing
             port.session.end(orderly=True)
@@ -272,7 +276,10 @@ class RunningPipe:
             return
         self.drops += 1
         self.problem = str(error)
-        if self.moves and isinstance(error, Refused):
+        lease = self._target.client.controller.lease
+        free = lease.holder is None and lease.pending_holder is None
+        if self.moves and isinstance(error, Refused) and (lease.settled or not free):
+            # Otherwise control is just being released, by a pipe that was stopped or another client.
             self.end(str(error))
         else:
             self.check()

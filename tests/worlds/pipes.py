@@ -69,9 +69,9 @@ class PipeScene:
         self.world.define()
         self.answers()
 
-    def answers(self) -> None:
-        """The robot confirms advertisements and subscriptions, and the service checks again."""
-        for _ in range(4):
+    def answers(self, times: int = 5) -> None:
+        """The robot confirms advertisements and subscriptions, and the service checks again, so many times."""
+        for _ in range(times):
             self.world.define()
             for made in self.world.link.take(link.Advertise):
                 self.world.channel.message(
@@ -80,7 +80,6 @@ class PipeScene:
             self.passes(module.CHECK_SECONDS)
             for made in self.world.link.all(link.Subscribe):
                 self.world.subscribed(made.number, made.type or STRING)
-        self.passes(module.CHECK_SECONDS)
 
     def passes(self, seconds: float) -> None:
         self.world.clock.advance(seconds)

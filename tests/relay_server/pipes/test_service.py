@@ -363,6 +363,25 @@ async def test_a_command_that_is_too_old_by_its_stamp_is_not_carried(scene: Pipe
     assert (found.state, found.why, found.messages, found.drops) == ("running", "", 3, 1)
 
 
+@pytest_twisted.ensureDeferred
+async def test_it_can_be_started_again_at_once(scene: PipeScene) -> None:
+    """It was stopped while it drove; that is no drive which goes on by itself."""
+    ann = await driving(scene)
+    scene.sends(text("on"))
+    scene.passes(0.01)
+    await scene.service.stop_pipe(ann, "copy")
+    await scene.service.start_pipe(ann, "copy")
+    scene.answers(1)
+    scene.pongs()
+    for _ in range(3):
+        scene.sends(text("on"))
+        scene.passes(0.01)
+    assert (await scene.state(ann)) == ("running", "")
+    holder = scene.world.controllers.of(scene.world.robot).lease.holder
+    assert holder is not None and holder.client.address == "pipe copy"
+    assert len(scene.world.link.commands) > 1
+
+
 async def stopped(scene: PipeScene) -> None:
     scene.front.bus.publish("robot.stopped", scene.world.robot.robot_id)
 
