@@ -70,9 +70,13 @@ async def _ready(buses: Buses) -> None:
         end = bus.subscribe("ready", lambda subject, body: body)
         await _until_it_responds(other, "ready")
         end()
+    await _until_it_leases(buses.first)
+
+
+async def _until_it_leases(bus: ClusterBus) -> None:
     while True:
         try:
-            lease = await buses.first.lease("ready.now", b"")
+            lease = await bus.lease("ready.now", b"")
         except Unavailable:
             continue
         await lease.release()
@@ -315,13 +319,19 @@ async def test_leases_are_stored_by_three_servers_also_if_one_address_is_given(
     servers: list[NatsServer],
 ) -> None:
     """Those that were stored by one before get more copies."""
-    single = NatsBus(reactor, [servers[0].url], replicas=1)
-    await single.start()
-    await (await single.lease("one", b"1")).release()
-    await single.stop()
-    bus = NatsBus(reactor, [servers[0].url])
-    await bus.start()
-    await (await bus.lease("two", b"2")).release()
-    info = await bus._deferred(bus._client.jetstream().stream_info(f"KV_{BUCKET}"))
-    assert info.config.num_replicas == 3
-    await bus.stop()
+
+    async def copies(bus: NatsBus) -> Any:
+        info = await bus._deferred(bus._client.jetstream().stream_info(f"KV_{BUCKET}"))
+        return info.config.num_replicas
+
+    before = NatsBus(reactor, [servers[0].url])
+    await before.start()
+    await _until_it_leases(before)
+    await before._deferred(before._client.jetstream().delete_key_value(BUCKET))
+    await before.stop()
+    for replicas, expected in ((1, 1), (None, 3)):
+        bus = NatsBus(reactor, [servers[0].url], replicas=replicas)
+        await bus.start()
+        await _until_it_leases(bus)
+        assert await copies(bus) == expected
+        await bus.stop()
