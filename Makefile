@@ -75,9 +75,8 @@ api-types: ## generate the portal's types of HTTP bodies from the relay's own
 	$(BIN)/python scripts/openapi.py --types >build/openapi.json
 	$(NPM) run api-types
 
-web: ## build the portal into relay_server/portal
-	@scripts/setup.sh python web
-	$(NPM) run build
+web: ## build the portal into relay_server/portal, and what the simulated robot needs
+	@scripts/setup.sh python web interfaces
 
 wheel: ## build the wheel with the portal inside, and the source archive, into dist
 	@scripts/setup.sh python web

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from cryptography import x509
 from OpenSSL import SSL
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 from twisted.internet.defer import DeferredList, maybeDeferred
 from twisted.internet.endpoints import (
     SSL4ServerEndpoint,
@@ -110,7 +114,7 @@ class Listeners:
 
 
 @implementer(IOpenSSLServerConnectionCreator)
-class ServerTls:
+class ServerTls(Collector):
     """Makes TLS connections for Twisted; its certificate can be read again while it serves.
 
     :param cert: PEM file with the chain, the relay's own certificate first
@@ -127,6 +131,11 @@ class ServerTls:
         """A connection with the certificate as it was last read."""
         return SSL.Connection(self._context, None)
 
+    def collect(self) -> Iterator[Metric]:
+        """See ``Collector``."""
+        what = "When the TLS certificate in use ends, Unix seconds"
+        yield GaugeMetricFamily("switchboard_certificate_expires_seconds", what, self._expires)
+
     def reload(self) -> None:
         """Read the files again; open connections keep the old certificate.
 
@@ -142,11 +151,14 @@ class ServerTls:
             context.use_certificate_chain_file(str(self._cert))
             context.use_privatekey_file(str(self._key))
             context.check_privatekey()
-        except (SSL.Error, OSError):
+            # The first certificate of the file is the relay's own.
+            own = x509.load_pem_x509_certificate(self._cert.read_bytes())
+        except (SSL.Error, OSError, ValueError):
             raise Invalid(
                 f"the TLS certificate {self._cert.name} with the key {self._key.name} can't be used: "
                 "both must be readable PEM files that belong together"
             ) from None
+        self._expires = own.not_valid_after_utc.timestamp()
         return context
 
 

@@ -142,7 +142,8 @@ def _sentence(failure: Failure) -> str:
     error = failure.value
     if isinstance(error, CannotListenError):
         reason = getattr(error.socketError, "strerror", None) or str(error.socketError)
-        return f"cannot listen on {error.interface or 'any address'} port {error.port}: {reason}"
+        where = f"{error.interface or 'any address'} port {error.port}"
+        return f"cannot listen on {where}: {reason}; give another address with --http or --robots"
     if isinstance(error, SwitchboardError):
         return str(error)
     if isinstance(error, OSError):

@@ -101,7 +101,9 @@ def main() -> None:
     help="Use TLS. Default: only with --ca or --server-name.",
 )
 @click.option(
-    "--ca", type=click.Path(dir_okay=False), help="PEM file of authorities to trust, instead of the system's."
+    "--ca",
+    type=click.Path(dir_okay=False),
+    help="PEM file of authorities to trust, instead of the system's; a copy is stored in the state folder.",
 )
 @click.option("--server-name", default="", help="Name in the relay's certificate, where it is not HOST.")
 @click.option("--replace", is_flag=True, help="Replace an existing enrolment.")
@@ -128,11 +130,13 @@ def enroll(
         raise Invalid("--ca and --server-name need TLS; leave out --no-tls")
     warn_if_plain(host, tls)
     if code == "-":
+        if sys.stdin.isatty():
+            click.echo("Enrolment code: ", nl=False, err=True)
         code = sys.stdin.readline()
     code = code.strip()
-    ca_path = str(Path(ca).resolve()) if ca else ""
     reactor = monotonic_reactor()
-    relay_endpoint = endpoint(reactor, host, port, tls, ca_path, server_name)
+    relay_endpoint = endpoint(reactor, host, port, tls, ca or "", server_name)
+    authorities = Path(ca).read_bytes() if ca else b""
     preparation = folder.prepare()
     try:
         enrolled = _wait(
@@ -142,9 +146,8 @@ def enroll(
         preparation.abandon()
         raise
     preparation.commit(
-        Enrolment(
-            address=relay, robot=robot, relay=enrolled.relay, tls=tls, ca=ca_path, server_name=server_name
-        )
+        Enrolment(address=relay, robot=robot, relay=enrolled.relay, tls=tls, server_name=server_name),
+        authorities,
     )
     click.echo(
         escape_unprintable(

@@ -65,7 +65,7 @@ _COMMANDS = {
         "Show registered services and applications and their addresses.",
     ),
     "audit": CommandEntry("relay_server.cli.events", "audit", "Read and verify the audit log."),
-    "db": CommandEntry("relay_server.cli.serve", "db", "Create or upgrade the database."),
+    "db": CommandEntry("relay_server.cli.serve", "db", "Create, upgrade or copy the database."),
 }
 
 _DEFAULT_DATA = Path("~/.local/share/switchboard")

@@ -63,14 +63,25 @@ class App:
 
     @property
     def database_url(self) -> str:
-        return self.given_url or f"sqlite:///{self.data.absolute() / 'switchboard.db'}"
+        return self.given_url or f"sqlite:///{self._file}"
+
+    @property
+    def _file(self) -> Path:
+        return self.data.absolute() / "switchboard.db"
 
     @contextmanager
-    def database(self) -> Iterator[Database]:
-        """The database, created or upgraded if necessary.
+    def database(self, *, create: bool = False) -> Iterator[Database]:
+        """The database, upgraded if necessary.
 
-        :raises Unavailable: it cannot be reached, or was written by a newer version
+        :param create: whether to create the file of SQLite
+        :raises Unavailable: there is no such file, or the database cannot be reached, or was written by a newer version
         """
+        if not create and self.given_url is None and _is_missing(self._file):
+            raise Unavailable(
+                f"there is no database in the data folder {self.data.absolute()}; give the relay's data folder with "
+                "--data, or the database with SWITCHBOARD_DB ('switchboard serve' and 'switchboard db upgrade' "
+                "create one)"
+            )
         database = Database(self.database_url)
         try:
             database.upgrade()
@@ -91,6 +102,17 @@ class App:
         with self.database() as database, database.begin() as session:
             yield LocalChange(session)
         notify_relay(self.data)
+
+
+def _is_missing(file: Path) -> bool:
+    try:
+        file.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        # Opening it says more.
+        return False
+    return False
 
 
 def get_user(session: Session, name: str) -> UserRecord:

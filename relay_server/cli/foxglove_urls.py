@@ -86,7 +86,7 @@ def create(
     print_result(as_json, {**answer, "level": level}, url)
     if not as_json:
         # Not to stdout, which a script may take as the URL.
-        click.echo(f"Number {number}, valid for {format_duration(seconds)}. It is not shown again.", err=True)
+        click.echo(f"URL {number}, valid for {format_duration(seconds)}. It is not shown again.", err=True)
         if level == "viewer":
             click.echo("It can watch, but not drive. A URL that drives needs --level operator.", err=True)
         if _is_loopback(url):

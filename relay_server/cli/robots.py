@@ -199,6 +199,7 @@ def _print_code(app: App, found: queries.RobotRecord, new: str, as_json: bool, *
         f"Enrolment code: {new} (works once, for {format_duration(ENROLMENT_SECONDS)})",
         "On the robot, run this and type the code in (the process list would show an argument):",
         f"  {shlex.join(command)}",
+        *(["With an authority of your own, write --ca ca.pem in place of --tls."] if tls else []),
     )
 
 

@@ -568,6 +568,7 @@ def _ready(relay: Relay, link: str | None) -> None:
     epilog=examples(
         "switchboard demo",
         "switchboard demo --http 127.0.0.1:9090 --data ./demo",
+        "switchboard demo --http 127.0.0.1:9090 --origin http://localhost:8000",
         "switchboard demo --home   # and a lamp, a blind, a door contact and a thermostat",
         "switchboard demo --cluster   # three relays, of which two may be killed",
         "switchboard demo --http 0.0.0.0:9090   # reachable from other machines",
@@ -584,7 +585,16 @@ def _ready(relay: Relay, link: str | None) -> None:
 @click.option("--robots", default="127.0.0.1:0", metavar="HOST:PORT", show_default=True)
 @click.option("--home", is_flag=True, help="Add a simulated home with MQTT devices; needs Mosquitto.")
 @click.option("--cluster", is_flag=True, help="Run three relays with PostgreSQL and NATS.")
-def demo(data: Path | None, http: str, robots: str, home: bool, cluster: bool) -> None:
+@click.option(
+    "--origin",
+    "origins",
+    multiple=True,
+    metavar="ORIGIN",
+    help="Origin of a page of your own that may use the relay; needs --http with a port.",
+)
+def demo(
+    data: Path | None, http: str, robots: str, home: bool, cluster: bool, origins: tuple[str, ...]
+) -> None:
     """Run a relay with two simulated ROS 2 robots and three users, until Ctrl-C.
 
     Prints READY with the address once both robots are online.
@@ -599,7 +609,12 @@ def demo(data: Path | None, http: str, robots: str, home: bool, cluster: bool) -
             folder = data.absolute()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         code = run_demo(
-            folder, ListenAddress.parse(http), ListenAddress.parse(robots), home=home, cluster=cluster
+            folder,
+            ListenAddress.parse(http),
+            ListenAddress.parse(robots),
+            home=home,
+            cluster=cluster,
+            origins=origins,
         )
     sys.exit(code)
 
@@ -633,6 +648,6 @@ def backup(app: App, folder: Path, as_json: bool) -> None:
 @pass_app
 def upgrade(app: App, as_json: bool) -> None:
     """Create the tables, or upgrade them. The relay does the same when it starts."""
-    with app.database() as database:
+    with app.database(create=True) as database:
         answer = {"database": database.url, "schema": schema.HEAD}
     print_result(as_json, answer, f"{database.url} has schema {schema.HEAD}.")

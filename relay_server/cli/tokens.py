@@ -55,7 +55,7 @@ def create(app: App, user: str, ttl: str, scope: str | None, label: str, as_json
     print_result(as_json, answer, secret)
     if not as_json:
         # Not to stdout, which a script may take as the token.
-        click.echo(f"Number {number}, valid for {format_duration(seconds)}. It is not shown again.", err=True)
+        click.echo(f"Token {number}, valid for {format_duration(seconds)}. It is not shown again.", err=True)
 
 
 @token.command("list", epilog=examples("switchboard token list", "switchboard token list --user ann"))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -15,7 +16,7 @@ from twisted.python.failure import Failure
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import Invalid, Unavailable
 from relay_server import logs
 from relay_server.common.clock import looping
 from relay_server.config import ListenAddress, RelaySettings
@@ -31,14 +32,22 @@ ONLINE_SECONDS = 90.0
 
 
 def run_demo(
-    folder: Path, http: ListenAddress, robots: ListenAddress, *, home: bool = False, cluster: bool = False
+    folder: Path,
+    http: ListenAddress,
+    robots: ListenAddress,
+    *,
+    home: bool = False,
+    cluster: bool = False,
+    origins: Sequence[str] = (),
 ) -> int:
     """Run until a signal ends it.
 
     :param folder: for the database, the robots' state and all logs
     :param home: whether to add a simulated home with MQTT devices
     :param cluster: whether to run three relays
+    :param origins: further ones whose pages may use the relay
     :returns: exit code
+    :raises Invalid: they are given without the port of HTTP
     :raises Unavailable: the home or the cluster needs a program that is not installed
     """
     if home:
@@ -48,6 +57,10 @@ def run_demo(
     settings = RelaySettings(
         data=folder, database=f"sqlite:///{folder / 'switchboard.db'}", http=http, robots=robots
     )
+    if origins:
+        if not http.port:
+            raise Invalid("--origin needs a port in --http, as in --http 127.0.0.1:9090")
+        settings = replace(settings, origins=(settings.url(http.port), *origins))
     with ExitStack() as stack:
         log = stack.enter_context((folder / "relay.log").open("a"))
         logs.begin(as_json=False, out=log, later=logs.later)

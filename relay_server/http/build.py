@@ -189,6 +189,8 @@ def _endpoints(services: Services, sources: Sources) -> list[object]:
     ]
     if core.cluster is not None:
         collectors.append(core.cluster.status)
+    if services.listeners.tls is not None:
+        collectors.append(services.listeners.tls)
     robots, summaries = RobotService(services.sessions), services.sessions.overview
     things = ThingService(
         core.reactor,

@@ -67,6 +67,9 @@ MEASURED_SECONDS = 1.0
 ON_EVERY_LINK = (link.Ping, link.Pong, link.Bye)
 """Messages that :meth:`RobotConnection.common_message` handles."""
 
+TLS_HELLO = b"\x16\x03"
+"""The first bytes of a peer that speaks TLS (RFC 8446 section 5.1). As a length of a frame they are far too large."""
+
 
 class LinkHandler(Protocol):
     """Handles what one connection of a robot receives: messages and frames."""
@@ -185,6 +188,9 @@ class RobotConnection(TwistedProtocol):
             return
         self._last_received = self._clock.seconds()
         if self._deadline is not None:
+            if not self._unauthenticated_bytes and data.startswith(TLS_HELLO):
+                self._protocol_broken(MalformedMessage("it speaks TLS, and this port was started without"))
+                return
             self._unauthenticated_bytes += len(data)
             if self._unauthenticated_bytes > limits.UNAUTHENTICATED_BYTES:
                 self._protocol_broken(

@@ -24,6 +24,7 @@ from robot_client.twisted_types import DialEndpoint
 
 KEY = "robot.key"
 STATE = "robot.json"
+CA = "ca.pem"
 _PENDING = "robot.key.pending"
 
 
@@ -33,7 +34,8 @@ class Enrolment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     :param address: ``host:port`` of the relay; of several relays, with commas in between
     :param robot: this robot's name
     :param relay: name of the relay; later a relay of another name is refused
-    :param ca: PEM file of the only trusted authorities, empty for the system's
+    :param ca: PEM file of the only trusted authorities, empty for the system's. In the state folder it is stored
+        relative to that
     :param server_name: name in the relay's certificate, empty for the host
     """
 
@@ -82,6 +84,8 @@ class StateFolder:
             )
         if len(key) != 32:
             raise StateError(f"{self.path / KEY} is damaged; enrol this robot again")
+        if enrolment.ca:
+            enrolment = msgspec.structs.replace(enrolment, ca=str(self.path.absolute() / enrolment.ca))
         return enrolment, Identity(enrolment.robot, enrolment.relay, key)
 
     def lock(self) -> int:
@@ -137,13 +141,19 @@ class Preparation:
         self._created_folder = created_folder
         self.public_key = identity.public_half(key)
 
-    def commit(self, enrolment: Enrolment) -> None:
+    def commit(self, enrolment: Enrolment, authorities: bytes = b"") -> None:
         """Make this key and this enrolment the robot's, after the relay has accepted the key.
 
+        :param authorities: certificates of the only trusted ones in PEM form, which are stored too
         :raises Invalid: they can't be stored; the code is used up
         """
         pending = self._path / (STATE + ".pending")
         try:
+            if authorities:
+                # The daemon runs as a user who may not read where they came from.
+                _write(self._path / (CA + ".pending"), authorities)
+                (self._path / (CA + ".pending")).replace(self._path / CA)
+                enrolment = msgspec.structs.replace(enrolment, ca=CA)
             _write(pending, msgspec.json.format(msgspec.json.encode(enrolment), indent=2) + b"\n")
             (self._path / _PENDING).replace(self._path / KEY)
             pending.replace(self._path / STATE)

@@ -145,6 +145,8 @@ def explain(failure: Failure) -> str:
         return str(problem)
     if isinstance(problem, SSL.Error):
         return _explain_tls(problem)
+    if isinstance(problem, error.DNSLookupError):
+        return f"the relay's host name can't be resolved ({problem})"
     for kind, text in _ERROR_TEXTS.items():
         if isinstance(problem, kind):
             return text
@@ -154,7 +156,6 @@ def explain(failure: Failure) -> str:
 _ERROR_TEXTS: dict[type[BaseException], str] = {
     error.ConnectionDone: "the relay closed the connection",
     error.ConnectionRefusedError: "the relay's address refuses connections; check that the relay is running",
-    error.DNSLookupError: "the relay's host name can't be resolved",
     error.TimeoutError: "the relay can't be reached: no answer in time",
     error.NoRouteError: "there is no route to the relay",
     error.ConnectionAborted: "the connection was cut on this side",
@@ -162,7 +163,9 @@ _ERROR_TEXTS: dict[type[BaseException], str] = {
 }
 
 _TLS_TEXTS = {
-    "wrong version number": "the relay does not use TLS on this port; in a trusted network use --no-tls",
+    "wrong version number": (
+        "the relay does not use TLS on this port; check the port, and in a trusted network use --no-tls"
+    ),
     "unexpected eof": "the relay ended the TLS connection early; check that it uses TLS on this port",
 }
 

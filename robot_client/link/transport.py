@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from twisted.internet.error import ConnectionDone, ConnectionLost
 from twisted.internet.interfaces import IPushProducer
 from twisted.internet.protocol import Protocol as TwistedProtocol
 from twisted.internet.protocol import connectionDone
@@ -101,6 +102,10 @@ class LinkProtocol(TwistedProtocol):
         self.flush()
 
     def dataReceived(self, data: bytes) -> None:
+        if not self._received and data.startswith(b"HTTP/"):
+            self.end(
+                LinkLost("this is a port for browsers and clients; robots dial another one, 9091 by default")
+            )
         self._received = True
         if self._has_ended():
             return
@@ -227,12 +232,10 @@ class LinkProtocol(TwistedProtocol):
     def _link_error(self, failure: Failure) -> SwitchboardError:
         if isinstance(failure.value, SwitchboardError):
             return failure.value
-        hint = (
-            ""
-            if self._received
-            else " before it sent anything; check that the address is a relay's, and that TLS is set as on the relay"
-        )
-        return LinkLost(explain(failure) + hint)
+        reason = explain(failure)
+        if not self._received and failure.check(ConnectionDone, ConnectionLost):
+            reason += " before it sent anything; check that the address is a relay's, and TLS as on the relay"
+        return LinkLost(reason)
 
     def _send_heartbeat(self) -> None:
         try:

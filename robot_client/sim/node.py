@@ -133,6 +133,11 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
             self._tf_static = self.create_publisher(TFMessage, "tf_static", _LATCHED)
             fixed = messages.static_transforms(self._now(), self._frames, CAMERA_HEIGHT)
             self._tf_static.publish(TFMessage(transforms=fixed))
+        else:
+            self.get_logger().warning(
+                "the package tf2_msgs is missing, so maps do not show the robot; source a ROS 2 that has it, or run "
+                "'make web' in a checkout"
+            )
         self.create_subscription(TwistMessage, "cmd_vel", self._on_command, _RELIABLE)
         self.create_service(Trigger, "reset", self._on_reset)
 

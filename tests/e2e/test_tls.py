@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import socket
 import ssl
 import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -125,6 +128,10 @@ def test_pages_and_websockets_come_over_tls(world: World) -> None:
     answer = ask(port, "GET", "/healthz", tls=world.context)
     assert answer.json == {"status": "ok"}
     assert "max-age=" in answer.headers["Strict-Transport-Security"]
+    headers = {"Authorization": f"Bearer {world.relay.user('root', admin=True)}"}
+    figures = ask(port, "GET", "/metrics", headers=headers, tls=world.context).body.decode()
+    (ends,) = re.findall(r"^switchboard_certificate_expires_seconds (\S+)", figures, re.M)
+    assert 0 < float(ends) - time.time() <= DAY.total_seconds()
     body = {"user": "driver", "password": "correct horse"}
     origin = {"Origin": f"https://127.0.0.1:{port}"}
     login = ask(port, "POST", "/api/v1/session", body, headers=origin, tls=world.context)
@@ -254,6 +261,42 @@ def test_a_robot_trusts_the_documented_authority(world: World, tmp_path: Path) -
         context.wrap_socket(plain, server_hostname="robots.example.org") as secure,
     ):
         assert secure.getpeercert()
+
+
+ROSLIBPY = """
+import sys
+
+import roslibpy
+
+ros = roslibpy.Ros(URL, headers={"Authorization": "Bearer TOKEN"})
+try:
+    ros.run(timeout=10)
+except Exception:
+    pass
+print(ros.is_connected, flush=True)
+ros.terminate()
+"""
+
+
+def test_roslibpy_checks_the_certificate_as_documented(world: World, tmp_path: Path) -> None:
+    """It connects to no relay of another authority or name, and so sends no token there."""
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/operate/tls.md").read_text("utf-8"), re.S)
+    url = f'"wss://127.0.0.1:{world.relay.http_port}/robots/rover"'
+    connects = ROSLIBPY.replace("URL", url).replace("TOKEN", world.token)
+    programs = []
+    for authority, name in (
+        (world.authority, "elsewhere.example"),
+        (world.authority, "other.example"),
+        (world.foreign, "elsewhere.example"),
+    ):
+        folder = tmp_path / f"{len(programs)}"
+        folder.mkdir()
+        shutil.copy(authority.path, folder / "ca.pem")
+        text = block.replace("robots.example.org", name) + connects
+        programs.append(
+            subprocess.Popen([sys.executable, "-c", text], cwd=folder, stdout=subprocess.PIPE, text=True)
+        )
+    assert [each.communicate(timeout=PATIENCE)[0].strip() for each in programs] == ["True", "False", "False"]
 
 
 @pytest.mark.parametrize("listener", ["http_port", "robots_port"])

@@ -103,6 +103,14 @@ class TestLogin:
         expect(seen(other, "login-error")).to_contain_text("used up")
         assert "ONCE-ONLY" not in other.url
 
+    def test_login_link_may_be_opened_where_the_page_is_shown_already(self, open_page: OpenPage) -> None:
+        """The page is not loaded again then."""
+        page = open_page("/login")
+        expect(seen(page, "login-user")).to_be_visible()
+        page.evaluate("location.hash = 'code=ONCE-ONLY'")
+        expect(seen(page, "robot-card")).to_have_count(3)
+        assert "ONCE-ONLY" not in page.url
+
     def test_the_page_asked_for_comes_after_the_login(self, open_page: OpenPage) -> None:
         """A user who opens a cockpit without a session logs in and gets that cockpit."""
         page = open_page(COCKPIT)

@@ -18,6 +18,7 @@ from sqlalchemy import create_engine, text
 from relay_db.schema import HEAD
 from relay_server.cli import main
 from relay_server.common.data_dir import SOCKET_NAME
+from tests.worlds.empty_database import write_empty_database
 
 CHANGES = [
     ("realm.add", ("realm", "add", "lab1")),
@@ -137,16 +138,32 @@ def test_the_data_folder_is_made_for_its_owner_only(cli: Any) -> None:
 
 def test_the_option_beats_the_variable(new_cli: Any, tmp_path: Path) -> None:
     """--data before the command precedes SWITCHBOARD_DATA."""
-    new_cli.ok("--data", str(tmp_path / "other"), "user", "add", "ann", "--no-password")
+    new_cli.ok("--data", str(tmp_path / "other"), "db", "upgrade")
     assert (tmp_path / "other" / "switchboard.db").exists()
     assert not new_cli.data.exists()
+
+
+def test_pages_of_other_origins_need_the_port_of_the_demo(cli: Any, tmp_path: Path) -> None:
+    error = cli.fails("demo", "--data", str(tmp_path / "demo"), "--origin", "http://localhost:8000")
+    assert "--origin needs a port in --http" in error
 
 
 def test_odd_folders_work(cli: Any, tmp_path: Path) -> None:
     """Paths may contain blanks, percent signs and hashes."""
     folder = tmp_path / "a b%41#c"
-    cli.ok("--data", str(folder), "user", "list")
+    cli.ok("--data", str(folder), "db", "upgrade")
     assert (folder / "switchboard.db").exists()
+    cli.ok("--data", str(folder), "user", "list")
+
+
+@pytest.mark.parametrize("command", [["user", "list"], ["robot", "add", "rover"], ["audit", "verify"]])
+def test_a_wrong_folder_is_refused_and_gets_no_database(
+    new_cli: Any, tmp_path: Path, command: list[str]
+) -> None:
+    folder = tmp_path / "wrong"
+    error = new_cli.fails("--data", str(folder), *command, code=3)
+    assert f"there is no database in the data folder {folder}; give the relay's" in error
+    assert not folder.exists()
 
 
 def test_another_database_is_taken_by_url(new_cli: Any, tmp_path: Path) -> None:
@@ -165,7 +182,7 @@ def test_a_database_that_is_not_there_is_exit_code_3(cli: Any, tmp_path: Path) -
     assert (result.exit_code, result.stdout) == (3, "")
     assert result.stderr == "Error: the database server can't be reached\n"
     (tmp_path / "file").write_text("")
-    assert "can't be used" in cli.fails("--data", str(tmp_path / "file" / "x"), "user", "list", code=3)
+    assert "can't be used" in cli.fails("--data", str(tmp_path / "file" / "x"), "db", "upgrade", code=3)
 
 
 def test_a_database_url_that_cannot_be_is_refused(cli: Any) -> None:
@@ -185,6 +202,7 @@ def test_a_relay_that_hangs_does_not_hold_a_change_up(
     with socket.socket(socket.AF_UNIX) as silent:
         silent.bind(str(short_folder / SOCKET_NAME))
         silent.listen()
+        write_empty_database(short_folder / "switchboard.db")
         cli.ok("--data", str(short_folder), "user", "add", "ann", "--no-password")
         reported = cli.fails("--data", str(short_folder), "status", code=3)
     assert "does not answer" in reported

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.worlds.empty_database import write_empty_database
 from tests.worlds.processes import BIN
 
 
@@ -20,6 +21,7 @@ def switchboard(data: Path, *arguments: str, **options: object) -> subprocess.Co
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A robot whose description has characters of several alphabets."""
     data = tmp_path_factory.mktemp("data")
+    write_empty_database(data / "switchboard.db")
     added = switchboard(data, "robot", "add", "rover", "--description", "Tür – 門", stdout=subprocess.DEVNULL)
     assert added.returncode == 0, added.stderr
     return data

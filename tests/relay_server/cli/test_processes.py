@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.worlds.empty_database import write_empty_database
+
 PASSWORD = "correct horse battery"
 PROGRAM = "from relay_server.cli import main; main(prog_name='switchboard')"
 
@@ -33,9 +35,15 @@ def _run(
     )
 
 
+def new_data(folder: Path) -> Path:
+    """A data folder with the database of a new relay."""
+    write_empty_database(folder / "data" / "switchboard.db")
+    return folder / "data"
+
+
 def test_the_contract_of_the_command_line(tmp_path: Path) -> None:
-    """The steps from an empty folder to a token, as scripts take them."""
-    data = tmp_path / "data"
+    """The steps from a new relay to a token, as scripts take them."""
+    data = new_data(tmp_path)
     added = _run(data, "--data", str(data), "user", "add", "ann", "--password-stdin", stdin=PASSWORD)
     assert (added.returncode, added.stderr) == (0, "")
     robot = _run(data, "--data", str(data), "robot", "add", "rover", "--json")
@@ -48,7 +56,7 @@ def test_the_contract_of_the_command_line(tmp_path: Path) -> None:
 
 def test_no_secret_is_in_the_data_folder(tmp_path: Path) -> None:
     """Passwords, tokens and codes are in no file, the write-ahead log included."""
-    data = tmp_path / "data"
+    data = new_data(tmp_path)
     _run(data, "user", "add", "ann", "--password-stdin", stdin=PASSWORD)
     code = json.loads(_run(data, "robot", "add", "rover", "--json").stdout)["enrolment_code"]
     token = json.loads(_run(data, "token", "create", "ann", "--json").stdout)["token"]
@@ -71,8 +79,7 @@ def test_no_secret_is_in_the_data_folder(tmp_path: Path) -> None:
 
 def test_admin_commands_import_neither_twisted_nor_alembic(tmp_path: Path) -> None:
     """This makes them start fast on a current database."""
-    data = tmp_path / "data"
-    assert _run(data, "db", "upgrade").returncode == 0
+    data = new_data(tmp_path)
     program = (
         "import sys\n"
         "from relay_server.cli import main\n"
@@ -86,21 +93,21 @@ def test_admin_commands_import_neither_twisted_nor_alembic(tmp_path: Path) -> No
 
 def test_a_failure_is_a_sentence(tmp_path: Path) -> None:
     """One line on stderr without a traceback; stdout stays empty."""
-    result = _run(tmp_path / "data", "user", "remove", "eve", "--yes")
+    result = _run(new_data(tmp_path), "user", "remove", "eve", "--yes")
     assert (result.returncode, result.stdout) == (1, "")
     assert result.stderr == "Error: there is no user 'eve'; see 'switchboard user list'\n"
 
 
 def test_arguments_that_are_no_text_are_refused(tmp_path: Path) -> None:
     """Bytes that are not UTF-8, as a shell may pass them."""
-    result = _run(tmp_path / "data", "user", "add", os.fsdecode(b"a\xff\x1b"), "--no-password")
+    result = _run(new_data(tmp_path), "user", "add", os.fsdecode(b"a\xff\x1b"), "--no-password")
     assert (result.returncode, result.stdout) == (1, "")
     assert result.stderr.startswith("Error: the name of a user must")
 
 
 def test_commands_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
-    """Several start on an empty folder; all succeed, each change is made once, and the audit chain is valid."""
-    data = tmp_path / "data"
+    """All succeed, each change is made once, and the audit chain is valid."""
+    data = new_data(tmp_path)
     env = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),

@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from relay_server.cli import main
+from tests.worlds.empty_database import write_empty_database
 
 
 def run(*arguments: str) -> str:
@@ -37,6 +38,7 @@ def run(*arguments: str) -> str:
 )
 def test_shared_options_stand_on_either_side(tmp_path: Path, command: list[str]) -> None:
     """The one behind the command counts."""
+    write_empty_database(tmp_path / "switchboard.db")
     run("--data", str(tmp_path), "robot", "add", "rover")
     robots = json.loads(run(*(word.format(data=tmp_path) for word in command)))
     assert [robot["robot"] for robot in robots] == ["rover"]

@@ -198,6 +198,13 @@ def test_hostile_bytes_are_refused_with_a_reason(scene: RobotLinkWorld, data: by
     assert not [call for call in scene.world.clock.getDelayedCalls() if call.active()]
 
 
+def test_a_robot_that_speaks_tls_is_refused_with_that_reason(scene: RobotLinkWorld) -> None:
+    robot = scene.dial()
+    robot.sends(b"\x16\x03\x01\x02\x00\x01\x00")
+    assert robot.refusal()["reason"] == "it speaks TLS, and this port was started without"
+    assert not robot.transport.connected
+
+
 def test_a_trickle_is_cut_by_an_absolute_deadline(scene: RobotLinkWorld) -> None:
     """Further bytes do not extend it."""
     robot = scene.dial()

@@ -36,6 +36,14 @@ def test_committed_enrolment_is_loaded(tmp_path: Path) -> None:
     assert sorted(each.name for each in (tmp_path / "s").iterdir()) == ["robot.json", "robot.key"]
 
 
+def test_authorities_are_stored_with_the_enrolment(tmp_path: Path) -> None:
+    """So the folder can be moved, and read by another user who may not read where they came from."""
+    StateFolder(tmp_path / "s").prepare().commit(ENROLMENT, b"PEM")
+    (tmp_path / "s").rename(tmp_path / "moved")
+    enrolment, _ = StateFolder(tmp_path / "moved").load()
+    assert (enrolment.ca, Path(enrolment.ca).read_bytes()) == (str(tmp_path / "moved" / "ca.pem"), b"PEM")
+
+
 def test_abandoned_preparation_leaves_nothing(tmp_path: Path) -> None:
     StateFolder(tmp_path / "s").prepare().abandon()
     assert not (tmp_path / "s").exists()

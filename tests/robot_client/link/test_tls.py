@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
+import socket
 import ssl
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from subprocess import PIPE, Popen
+from subprocess import PIPE, Popen, run
 
 import pytest
 from cryptography import x509
@@ -20,6 +21,7 @@ from cryptography.x509.oid import NameOID
 
 from relay_protocol.errors import Invalid
 from robot_client import cli
+from robot_client.link.enrolment import StateFolder
 from robot_client.link.tls import is_loopback, split_address, trust_root
 from tests.worlds.fake_relay import PATIENCE, FakeRelay
 
@@ -109,6 +111,9 @@ def test_own_ca_and_right_name_are_accepted(relay: FakeRelay, ca: Authority, tmp
     code, said, answered = enroll(relay, tmp_path / "s", "--tls", "--ca", str(ca.path))
     assert code == 0, said
     assert answered
+    enrolment, _ = StateFolder(tmp_path / "s").load()
+    assert enrolment.ca == str(tmp_path / "s" / "ca.pem")
+    assert Path(enrolment.ca).read_bytes() == ca.path.read_bytes()
 
 
 def test_server_name_can_be_set(relay: FakeRelay, ca: Authority, tmp_path: Path) -> None:
@@ -152,6 +157,36 @@ def test_private_ca_is_refused_without_the_option(relay: FakeRelay, ca: Authorit
 def test_plain_relay_is_reported_to_a_tls_client(relay: FakeRelay, ca: Authority, tmp_path: Path) -> None:
     said = refused(relay, tmp_path, "--tls", "--ca", str(ca.path))
     assert "TLS" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], "this is a port for browsers and clients; robots dial another one, 9091 by default"),
+        (
+            ["--tls"],
+            "the relay does not use TLS on this port; check the port, and in a trusted network use --no-tls",
+        ),
+    ],
+)
+def test_a_port_that_is_none_for_robots_is_reported(
+    tmp_path: Path, options: list[str], expected: str
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            connection, _ = server.accept()
+            connection.recv(65536)
+            connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+            connection.close()
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        command = [*ENROLL, "--relay", address, "--state", str(tmp_path / "s"), *options]
+        done = run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        thread.join()
+    assert f"Error: {expected}\n" in done.stderr
 
 
 def test_missing_ca_file_is_reported(relay: FakeRelay, tmp_path: Path) -> None:
