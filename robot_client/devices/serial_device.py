@@ -118,8 +118,10 @@ class SerialPort:
             self._ending = True
             self._changed.notify_all()
             if self._device is not None:
-                self._device.cancel_read()
-                self._device.cancel_write()
+                # The reader may close it at this moment, as it is lost.
+                with contextlib.suppress(OSError):
+                    self._device.cancel_read()
+                    self._device.cancel_write()
         if self._reader.is_alive():
             self._reader.join(CLOSE_SECONDS)
 
