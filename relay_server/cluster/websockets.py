@@ -41,7 +41,8 @@ MOST_PONGS = 16
 """Most answers to pings that wait for the end of a fragmented message; the newest count."""
 
 UNSENT_BYTES = 4 << 20
-"""Most bytes that are written while the home takes none; more close the websocket."""
+"""When so many bytes were written while the home takes none, one more message closes the websocket. A single one may
+be larger."""
 
 _REFUSALS: dict[int, type[SwitchboardError]] = {
     400: Invalid,
@@ -221,24 +222,25 @@ class ForwardedWebSocket:
     def _send(self, frame: bytes) -> None:
         if self._ended or self._home is None:
             return
+        if self._paused_bytes is not None and self._paused_bytes > UNSENT_BYTES:
+            self.close(close_codes.UNAVAILABLE, "the robot's relay takes no messages; connect again")
+            return
         pongs, self._pongs = self._pongs, []
         self._home.transport.write(b"".join([frame, *pongs]))
         if self._paused_bytes is not None:
             self._paused_bytes += len(frame)
-            if self._paused_bytes > UNSENT_BYTES:
-                self.close(close_codes.UNAVAILABLE, "the robot's relay takes no messages; connect again")
 
     # --- flow to the home ---------------------------------------------------------------------------------
 
     def home_paused(self) -> None:
         """The home takes no bytes, so the client is not read."""
         self._paused_bytes = 0
-        self._transport.transport.pauseProducing()
+        self._transport.pause_reading()
 
     def home_resumed(self) -> None:
         """The home takes bytes again."""
         self._paused_bytes = None
-        self._transport.transport.resumeProducing()
+        self._transport.resume_reading()
 
     # --- the home -----------------------------------------------------------------------------------------
 
@@ -296,8 +298,11 @@ class ForwardedWebSocket:
 class ForwardedTransport(ClientTransport, Protocol):
     """The websocket of the client."""
 
-    transport: Any
-    """Its connection."""
+    def pause_reading(self) -> None:
+        """Read nothing more from the client."""
+
+    def resume_reading(self) -> None:
+        """Read the client again."""
 
     def dropConnection(self, abort: bool = False) -> None:
         """End the connection without a close frame."""

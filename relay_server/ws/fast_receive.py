@@ -72,6 +72,9 @@ class FastProtocol(WebSocketServerProtocol):
         self._pass_everything = False
         """Whether a frame was invalid, so that Autobahn receives all bytes."""
         self._reading_paused = False
+        """Whether the client's share of this reactor turn is used up."""
+        self._reading_held = False
+        """Whether the receiver of its messages takes none, see :meth:`pause_reading`."""
 
     def dataReceived(self, data: bytes) -> None:
         """Read a chunk of the client's bytes; it may begin and end anywhere in a frame."""
@@ -174,6 +177,17 @@ class FastProtocol(WebSocketServerProtocol):
         self.transport.pauseProducing()
         self.factory.reactor.callLater(0, self._continue)
 
+    def pause_reading(self) -> None:
+        """Read nothing more from the connection until :meth:`resume_reading`."""
+        self._reading_held = True
+        self.transport.pauseProducing()
+
+    def resume_reading(self) -> None:
+        """The receiver of the messages takes more."""
+        self._reading_held = False
+        if not self._reading_paused:
+            self.transport.resumeProducing()
+
     def _continue(self) -> None:
         waiting, self._unread = self._unread, None
         self._reading_paused = False
@@ -185,7 +199,7 @@ class FastProtocol(WebSocketServerProtocol):
             self.handling_failed()
             if self.state == _OPEN:
                 return
-        if not self._reading_paused and self.state in _ESTABLISHED:
+        if not (self._reading_paused or self._reading_held) and self.state in _ESTABLISHED:
             self.transport.resumeProducing()
 
     def handling_failed(self) -> None:

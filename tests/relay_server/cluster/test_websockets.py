@@ -157,6 +157,12 @@ class ClientTransport:
     def dropConnection(self, abort: bool = False) -> None:
         self.closed = "dropped"
 
+    def pause_reading(self) -> None:
+        self.transport.pauseProducing()
+
+    def resume_reading(self) -> None:
+        self.transport.resumeProducing()
+
 
 class Endpoints:
     """Connects to a home in memory, at once or never."""
@@ -308,3 +314,16 @@ def test_what_a_stalled_home_does_not_take_is_bounded() -> None:
     for _ in range(6):
         session.message(bytes(1 << 20))
     assert transport.closed == (4503, "the robot's relay takes no messages; connect again")
+
+
+def test_the_largest_message_passes_though_the_home_takes_it_in_pieces() -> None:
+    _, endpoints, transport, session, _ = forwarded()
+    endpoints.protocol.dataReceived(HEAD)
+    session.start()
+    endpoints.home.producer.pauseProducing()
+    session.message(bytes(10_000_000))
+    assert transport.closed is None
+    endpoints.home.producer.resumeProducing()
+    assert transport.transport.producerState == "producing"
+    session.message(b"next")
+    assert (transport.closed, len(endpoints.home.value()) > 10_000_000) == (None, True)

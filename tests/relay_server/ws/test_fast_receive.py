@@ -389,6 +389,23 @@ def test_a_flood_gives_others_their_turn() -> None:
     assert flooder.transport.producerState == "producing"
 
 
+def test_a_client_whose_receiver_is_full_is_not_read_when_its_turn_comes_again() -> None:
+    clock = SlowClock()
+    flooder = opened(Fast, clock)
+    clock.step = fast_receive.SHARE_SECONDS / 10
+    flooder.dataReceived(b"".join(frame(b"%020d" % number) for number in range(50)))
+    flooder.pause_reading()
+    while flooder._reading_paused:
+        clock.advance(0)
+    assert flooder.transport.producerState == "paused"
+    flooder.resume_reading()
+    assert flooder.transport.producerState == "producing"
+    flooder.dataReceived(b"".join(frame(b"%020d" % number) for number in range(50)))
+    flooder.pause_reading()
+    flooder.resume_reading()
+    assert flooder.transport.producerState == "paused"
+
+
 def test_slow_frames_have_the_same_share_of_time() -> None:
     """Fragments and pings count too."""
     clock = SlowClock()
