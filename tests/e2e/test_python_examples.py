@@ -24,8 +24,8 @@ from tests.worlds.doc_scene import DIRECTORY, DOCUMENTS, ROBOT, ROOT, Scene, sta
 from tests.worlds.processes import Process, ros_environment, running
 from tests.worlds.waiting import PATIENCE, wait_for
 
-ELSEWHERE = ("devices.md", "remote_goals.md", "offload.md")
-"""Their programs need no relay: they run in tests/robot_client/devices and in tests/robot_client/functions."""
+ELSEWHERE = ("devices.md", "remote_goals.md", "offload.md", "tls.md")
+"""Their programs run in tests/robot_client/devices, in tests/robot_client/functions, and in test_tls.py."""
 PAGES = [path for path in DOCUMENTS if path.name not in ELSEWHERE]
 SHOWN = [each for path in PAGES for each in programs(path)]
 CONNECTED, ENDS = "ros.run()\n", "ros.terminate()\n"
