@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
 import msgspec
@@ -11,9 +12,10 @@ from twisted.web.http import OK
 
 from relay_db.queries import RobotRecord
 from relay_protocol import jsontext
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.access import Principal
-from relay_server.cluster.forwarding import ForwardedClient, Forwarder
+from relay_server.cluster.forwarding import ForwardedClient, Forwarder, RelayAnswer
 from relay_server.cluster.homes import RobotHomes
 from relay_server.cluster.relays import RelayInfo
 from relay_server.fleet.order import Order, TaskOutcome, body_of
@@ -22,6 +24,8 @@ PATH = "/api/v1/fleet"
 
 AT_ONCE = 64
 """Orders that are sent at a time."""
+PRECONDITION_REQUIRED = 428
+"""The home must know how old the order is (RFC 6585 section 3)."""
 MOST_ROBOTS = 200
 """Robots of an order that is sent."""
 
@@ -30,11 +34,12 @@ class OrderForwarding(Protocol):
     """Sends an order to the home of a robot."""
 
     async def send(
-        self, principal: Principal, address: str, order: Order, robot: RobotRecord
+        self, principal: Principal, address: str, order: Order, robot: RobotRecord, earliest_sent: int | None
     ) -> TaskOutcome | None:
         """Have the home carry out an order on one robot.
 
         :param address: network address of the client
+        :param earliest_sent: when it can have been sent, monotonic nanoseconds of this relay; ``None``: unknown
         :returns: ``None``: the robot is at no other relay
         :raises Unavailable: the home can't be reached
         """
@@ -44,7 +49,7 @@ class NoOrderForwarding:
     """The only relay has all robots (:class:`OrderForwarding`)."""
 
     async def send(
-        self, principal: Principal, address: str, order: Order, robot: RobotRecord
+        self, principal: Principal, address: str, order: Order, robot: RobotRecord, earliest_sent: int | None
     ) -> TaskOutcome | None:
         """There is no other relay."""
         return None
@@ -56,10 +61,13 @@ class _OrderToHome:
     :param order: with all its robots
     """
 
-    def __init__(self, relay: RelayInfo, order: Order, client: ForwardedClient) -> None:
+    def __init__(
+        self, relay: RelayInfo, order: Order, client: ForwardedClient, earliest_sent: int | None
+    ) -> None:
         self.relay = relay
         self.order = order
         self.client = client
+        self.earliest_sent = earliest_sent
         self.sending: Deferred[None] | None = None
         self._waiting: dict[str, Deferred[TaskOutcome]] = {}
 
@@ -116,15 +124,21 @@ class _OrderToHome:
 
 
 class ClusterOrders:
-    """See :class:`OrderForwarding`. Orders go without their age, so the home refuses those that need one.
+    """See :class:`OrderForwarding`.
 
-    Robots of an order whose turn comes at the same time are sent together.
+    Robots of an order whose turn comes at the same time are sent together. A home that needs to know the age of the
+    order refuses it first, with a freshness token. The order is then sent with that token, and with the time from
+    when it can have been sent until the token was here: at least that much older than the token it is.
 
     :param reactor: Twisted's
+    :param clock_ns: monotonic nanoseconds
     """
 
-    def __init__(self, reactor: Any, homes: RobotHomes, forwarder: Forwarder) -> None:
+    def __init__(
+        self, reactor: Any, homes: RobotHomes, forwarder: Forwarder, clock_ns: Callable[[], int] = now_ns
+    ) -> None:
         self._reactor = reactor
+        self._clock_ns = clock_ns
         self._homes = homes
         self._forwarder = forwarder
         self._turns = DeferredSemaphore(AT_ONCE)
@@ -132,7 +146,7 @@ class ClusterOrders:
         """Orders that are sent in a moment, by relay, client and identity of the order."""
 
     async def send(
-        self, principal: Principal, address: str, order: Order, robot: RobotRecord
+        self, principal: Principal, address: str, order: Order, robot: RobotRecord, earliest_sent: int | None
     ) -> TaskOutcome | None:
         """See :meth:`OrderForwarding.send`."""
         relay = self._homes.elsewhere(robot.id)
@@ -142,7 +156,7 @@ class ClusterOrders:
         key = relay.id, client, id(order)
         sent = self._gathered.get(key)
         if sent is None or len(sent.robots) >= MOST_ROBOTS:
-            sent = self._gathered[key] = _OrderToHome(relay, order, client)
+            sent = self._gathered[key] = _OrderToHome(relay, order, client, earliest_sent)
             self._reactor.callLater(0, self._begin, key, sent)
         return await sent.outcome(robot.name)
 
@@ -156,13 +170,19 @@ class ClusterOrders:
     async def _send(self, sent: _OrderToHome) -> None:
         await self._turns.acquire()
         try:
-            body = body_of(sent.order, sent.robots)
-            answer = await self._forwarder.ask_lines(
-                "POST", PATH, body, sent.relay, sent.client, sent.answered
-            )
+            answer = await self._ask(sent, sent.client)
+            if answer.status == PRECONDITION_REQUIRED and answer.freshness and sent.earliest_sent is not None:
+                # The token was made before this moment.
+                older = self._clock_ns() - sent.earliest_sent
+                client = msgspec.structs.replace(sent.client, older_ns=older)
+                answer = await self._ask(sent, client, answer.freshness)
         finally:
             self._turns.release()
-        sent.ended(*answer)
+        sent.ended(answer.status, answer.body)
+
+    def _ask(self, sent: _OrderToHome, client: ForwardedClient, token: str = "") -> Awaitable[RelayAnswer]:
+        body = body_of(sent.order, sent.robots)
+        return self._forwarder.ask_lines(PATH, body, sent.relay, client, token, sent.answered)
 
 
 def _object(line: bytes) -> dict[str, Any]:

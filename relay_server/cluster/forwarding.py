@@ -10,7 +10,7 @@ import base64
 import hmac
 from collections.abc import Callable, Sequence
 from io import BytesIO
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 from twisted.internet.address import IPv4Address, IPv6Address
@@ -43,6 +43,7 @@ from relay_server.cluster.relays import RelayInfo, check_compatible, lost, unrea
 from relay_server.common import close_codes
 from relay_server.common.clock import Clock, sleep
 from relay_server.common.concurrency import with_timeout
+from relay_server.common.freshness_tokens import HEADER as FRESHNESS
 from relay_server.config import ClusterSettings
 from relay_server.robots.registry import RobotRegistry
 
@@ -89,6 +90,7 @@ class ForwardedClient(msgspec.Struct, frozen=True):
     :param early: whether it may have sent messages before the home knew it; they are older than the home knows
     :param scope: as text; ``None`` for all rights of the user
     :param final: whether the relay answers by what it has itself, and asks no other relay
+    :param older_ns: nanoseconds by which the request is older than its freshness token
     """
 
     address: str
@@ -102,6 +104,7 @@ class ForwardedClient(msgspec.Struct, frozen=True):
     scope: str | None
     robot_id: int | None
     final: bool = False
+    older_ns: int = 0
 
     @classmethod
     def of(
@@ -127,7 +130,7 @@ class ForwardedClient(msgspec.Struct, frozen=True):
     def principal(self) -> Principal:
         """The client's principal."""
         fields = msgspec.structs.asdict(self)
-        del fields["address"], fields["early"], fields["final"]
+        del fields["address"], fields["early"], fields["final"], fields["older_ns"]
         return Principal(**{**fields, "scope": None if self.scope is None else Scope(self.scope)})
 
 
@@ -145,6 +148,17 @@ def without_credentials(target: str) -> str:
     kept = [each for each in query.split("&") if each.partition("=")[0] not in _CREDENTIAL_PARAMETERS]
     query = "&".join(kept)
     return f"{path}?{query}" if query else path
+
+
+class RelayAnswer(NamedTuple):
+    """The answer of another relay.
+
+    :param freshness: a freshness token, or empty
+    """
+
+    status: int
+    body: bytes
+    freshness: str
 
 
 class Forwarder:
@@ -204,26 +218,28 @@ class Forwarder:
         :param body: JSON, or empty
         :raises Unavailable: the other relay can't be reached, or is of another version
         """
-        return await self._ask(method, path, body, relay, client, readBody)
+        answer = await self._ask(method, path, body, relay, client, readBody)
+        return answer.status, answer.body
 
     async def ask_lines(
         self,
-        method: str,
         path: str,
         body: bytes,
         relay: RelayInfo,
         client: ForwardedClient,
+        token: str,
         on_line: Callable[[bytes], None],
-    ) -> tuple[int, bytes]:
-        """As :meth:`ask`, for an answer in lines; returns the body only if the status is not 200.
+    ) -> RelayAnswer:
+        """As :meth:`ask`, of a POST whose answer is lines; their body is not returned.
 
+        :param token: a freshness token of the other relay, or empty
         :param on_line: gets each line as soon as it has come
         """
 
         def read(response: Any) -> Deferred[bytes]:
             return _AnswerLines(on_line).read(response) if response.code == OK else readBody(response)
 
-        return await self._ask(method, path, body, relay, client, read)
+        return await self._ask("POST", path, body, relay, client, read, token)
 
     async def _ask(
         self,
@@ -233,17 +249,21 @@ class Forwarder:
         relay: RelayInfo,
         client: ForwardedClient,
         read: Callable[[Any], Deferred[bytes]],
-    ) -> tuple[int, bytes]:
+        token: str = "",
+    ) -> RelayAnswer:
         check_compatible(relay)
         fields = Headers({"Content-Type": ["application/json"]})
         for name, value in self.headers(client).items():
             fields.setRawHeaders(name, [value])
+        if token:
+            fields.setRawHeaders(FRESHNESS, [token])
         url = f"http://{relay.address}{path}".encode()
         try:
             producer = FileBodyProducer(BytesIO(body)) if body else None
             sending = self._agent.request(method.encode(), url, fields, producer)
             response = await self._while_it_answers(relay, sending)
-            return response.code, await self._while_it_answers(relay, read(response))
+            made = response.headers.getRawHeaders(FRESHNESS, [""])[0]
+            return RelayAnswer(response.code, await self._while_it_answers(relay, read(response)), made)
         except (ConnectError, DNSLookupError, TimeoutError):
             raise unreachable(relay) from None
         except (RequestTransmissionFailed, ResponseFailed, PartialDownloadError):

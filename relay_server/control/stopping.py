@@ -331,8 +331,8 @@ class StopController:
             )
         elif robot.elsewhere:
             raise Unavailable(
-                f"robot {robot.name} is connected to another relay, which needs the age of a resume: resume it in the "
-                "portal or over HTTP, or on the machine of that relay"
+                f"robot {robot.name} is connected to another relay, which needs the age of a resume: resume it by "
+                f"'switchboard robot resume {robot.name}', in the portal or over HTTP"
             )
         elif robot.motion_state.stopped is not None:
             raise Unavailable(f"robot {robot.name} is offline, and stopped: resume it when it is back")

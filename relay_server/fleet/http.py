@@ -96,8 +96,10 @@ class FleetEndpoints:
             refuse_key(request)
             earliest_sent = self._tokens.read(request.http.getHeader(HEADER))
         principal, address = request.principal, request.address
-        forwarded = request.http.forwarded_client is not None
-        plan = await self._service.plan(principal, order, address, earliest_sent, forwarded=forwarded)
+        first = request.http.forwarded_client
+        if first is not None and earliest_sent is not None:
+            earliest_sent -= first.older_ns
+        plan = await self._service.plan(principal, order, address, earliest_sent, forwarded=first is not None)
 
         async def run(http: Request) -> None:
             await _carry_out(self._clock, self._service, http, plan)

@@ -372,7 +372,7 @@ class FleetService:
 
         :returns: ``None``: it is connected to no other relay, or that does not answer an order to stop
         """
-        sending = self._forwarding.send(plan.principal, plan.address, plan.order, robot)
+        sending = self._forwarding.send(plan.principal, plan.address, plan.order, robot, plan.earliest_sent)
         if plan.order.do != "stop":
             return await sending
         try:

@@ -60,6 +60,8 @@ def load_class(path: str) -> type[Module]:
     :raises WrongSetting: there is no such class, or its file can't be imported
     """
     file, _, name = path.partition(":")
+    if not name:
+        raise WrongSetting(f"python = '{path}' names no class; write package.module:Class")
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(file), name, None)

@@ -130,7 +130,8 @@ class SerialPort:
 
         while not self._ending:
             try:
-                device = serial.Serial(self._path, self._baud)
+                # Two readers would each get a part of the lines.
+                device = serial.Serial(self._path, self._baud, exclusive=True)
             except OSError as error:
                 self._report(str(error))
             else:
@@ -196,7 +197,8 @@ class SerialPort:
             self._changed.notify_all()
         if was_open is not (device is not None):
             self._connected(device is not None)
-        if device is not None:
+        if device is not None and self._problem:
+            self._print("open")
             self._problem = ""
 
     def _report(self, problem: str) -> None:

@@ -27,7 +27,11 @@ def main() -> None:
         raise SystemExit(
             """usage: python -m robot_client.devices.trial PACKAGE.MODULE:CLASS ['{"port": "/dev/ttyUSB0"}']"""
         )
-    path, settings = sys.argv[1], json.loads(sys.argv[2] if len(sys.argv) == 3 else "{}")
+    path = sys.argv[1]
+    try:
+        settings = json.loads(sys.argv[2] if len(sys.argv) == 3 else "{}")
+    except ValueError as error:
+        raise SystemExit(f"the settings are not JSON: {error}") from None
     own, other = socket.socketpair()
     with (
         own,

@@ -333,12 +333,29 @@ def test_the_command_line_at_another_relay_reaches_pipes(fleet: Fleet) -> None:
     assert fleet.first.cli("pipe", "list") == {"pipes": []}
 
 
-def test_the_command_line_at_another_relay_refuses_to_resume(fleet: Fleet) -> None:
+def test_a_robot_is_resumed_by_orders_of_another_relay(fleet: Fleet) -> None:
+    """The home finds out how old the order can be."""
     refused = fleet.second.run_cli("resume", "rover")
     assert refused.returncode != 0
     assert "robot rover is connected to another relay" in refused.stderr
-    assert "over HTTP" in refused.stderr
+    assert "resume it by 'switchboard robot resume rover'" in refused.stderr
+    (stopped,) = fleet.second.cli("robot", "stop", "rover")["results"]
+    assert stopped["ok"], stopped
+    wait_for("it is stopped", lambda: fleet.robot.stopped is not None)
+    (resumed,) = fleet.second.cli("robot", "resume", "rover")["results"]
+    assert resumed["ok"], resumed
+    wait_for("it may move", lambda: fleet.robot.stopped is None)
     assert "online at another relay" in fleet.second.run_cli("status", "rover").stdout
+    url = f"http://127.0.0.1:{fleet.second.http_port}/api/v1/fleet"
+    headers = {"Authorization": f"Bearer {fleet.token}"}
+    answer = httpx.post(url, json={"robots": ["*"], "do": "stop"}, headers=headers, timeout=PATIENCE)
+    assert json.loads(answer.text.splitlines()[1])["ok"], answer.text
+    body = {"robots": ["*"], "do": "resume"}
+    answer = httpx.post(url, json=body, headers=headers, timeout=PATIENCE)
+    assert answer.status_code == 428
+    token = {"Switchboard-Freshness": answer.headers["Switchboard-Freshness"]}
+    answer = httpx.post(url, json=body, headers={**headers, **token}, timeout=PATIENCE)
+    assert json.loads(answer.text.splitlines()[1])["ok"], answer.text
 
 
 def test_a_pipe_runs_at_the_home_of_its_robot(fleet: Fleet) -> None:

@@ -15,6 +15,7 @@ from relay_db.queries import RobotRecord
 from relay_protocol.errors import Unavailable
 from relay_server.access import Principal
 from relay_server.cluster.fleet_orders import ClusterOrders
+from relay_server.cluster.forwarding import RelayAnswer
 from relay_server.cluster.relays import RelayInfo
 from relay_server.fleet.order import Order, TaskOutcome, body_of
 
@@ -32,6 +33,7 @@ class Fleet:
         self.asked: list[tuple[Any, ...]] = []
         self.lines = [START, RESULT, END]
         self.answer = (200, b"")
+        self.answers: list[RelayAnswer] = []
         self.ending: Deferred[None] | None = None
         self.on_line: Callable[[bytes], None] = lambda line: None
 
@@ -39,7 +41,7 @@ class Fleet:
         """The home of odd robots."""
         return HOME if robot_id % 2 else None
 
-    async def ask_lines(self, *arguments: Any) -> tuple[int, bytes]:
+    async def ask_lines(self, *arguments: Any) -> RelayAnswer:
         """Executes the order, as far as a test has said."""
         *asked, on_line = arguments
         self.asked.append(tuple(asked))
@@ -48,13 +50,15 @@ class Fleet:
             on_line(line)
         if self.ending is not None:
             await self.ending
-        return self.answer
+        return self.answers.pop(0) if self.answers else RelayAnswer(*self.answer, "")
 
 
-def sending(fleet: Any, order: Order, *robots: RobotRecord) -> list[Deferred[TaskOutcome | None]]:
+def sending(
+    fleet: Any, order: Order, *robots: RobotRecord, sent: int | None = None, now: int = 0
+) -> list[Deferred[TaskOutcome | None]]:
     clock = Clock()
-    orders = ClusterOrders(clock, fleet, fleet)
-    found = [Deferred.fromCoroutine(orders.send(ANN, "192.0.2.1", order, each)) for each in robots]
+    orders = ClusterOrders(clock, fleet, fleet, lambda: now)
+    found = [Deferred.fromCoroutine(orders.send(ANN, "192.0.2.1", order, each, sent)) for each in robots]
     clock.advance(0)
     return found
 
@@ -71,8 +75,8 @@ def test_an_order_goes_to_the_home_for_one_robot() -> None:
     order = Order(["r*"], "call", service="/say", args=msgspec.Raw(b'{"x":1}'), timeout=3.0)
     assert sent(fleet, order, 2) is None
     assert sent(fleet, order, 1) == TaskOutcome(True, "yes", {"a": 1})
-    ((method, path, body, relay, client),) = fleet.asked
-    assert (method, path, relay) == ("POST", "/api/v1/fleet", HOME)
+    ((path, body, relay, client, token),) = fleet.asked
+    assert (path, relay, token) == ("/api/v1/fleet", HOME, "")
     assert (client.name, client.address) == ("ann", "192.0.2.1")
     assert json.loads(body) == {
         "robots": ["rover"],
@@ -110,7 +114,7 @@ def test_robots_of_one_relay_are_sent_together_and_each_outcome_is_passed_on_whe
     fleet.lines, fleet.ending = [START], Deferred()
     found = sending(fleet, Order(["*"], "stop"), *many(3))
     (asked,) = fleet.asked
-    assert json.loads(asked[2])["robots"] == ["r0", "r1", "r2"]
+    assert json.loads(asked[1])["robots"] == ["r0", "r1", "r2"]
     fleet.on_line(RESULT.replace(b"rover", b"r1"))
     assert [each.called for each in found] == [False, True, False]
     # The stop of r0 is not waited for any longer, that of r2 is.
@@ -124,11 +128,28 @@ def test_robots_of_one_relay_are_sent_together_and_each_outcome_is_passed_on_whe
     assert outcomes == [None, TaskOutcome(True, "yes", {"a": 1}), TaskOutcome(False, "yes", {"a": 1})]
 
 
+@pytest.mark.parametrize(
+    ("sent", "sent_again"), [(3_000, [("t1", 4_000)]), (None, [])], ids=["of known age", "of unknown age"]
+)
+def test_a_home_that_needs_the_age_gets_it(sent: int | None, sent_again: list[tuple[str, int]]) -> None:
+    """The order is at least as much older than the token as time has passed from when it was sent until now."""
+    fleet = Fleet()
+    fleet.lines, fleet.answer = [], (200, b"")
+    fleet.answers = [RelayAnswer(428, b'{"detail":"prove that this is fresh"}', "t1")]
+    (found,) = sending(fleet, Order(["*"], "resume"), *many(1), sent=sent, now=7_000)
+    assert [(each[4], each[3].older_ns) for each in fleet.asked] == [("", 0), *sent_again]
+    if sent is None:
+        result: Any = found.result
+        assert result == TaskOutcome(False, "prove that this is fresh")
+    else:
+        found.addErrback(lambda failure: None)
+
+
 def test_a_thousand_robots_are_several_orders() -> None:
     fleet = Fleet()
     fleet.lines = [RESULT.replace(b"rover", f"r{each}".encode()) for each in range(1000)]
     found = sending(fleet, Order(["*"], "stop"), *many(1000))
-    assert [len(json.loads(each[2])["robots"]) for each in fleet.asked] == [200] * 5
+    assert [len(json.loads(each[1])["robots"]) for each in fleet.asked] == [200] * 5
     assert all(each.called for each in found)
 
 

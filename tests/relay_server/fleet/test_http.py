@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import pytest
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import capturedLogs
@@ -15,6 +16,7 @@ from twisted.logger import capturedLogs
 from relay_db.queries import RobotRecord
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import Principal
+from relay_server.cluster.forwarding import ForwardedClient
 from relay_server.common.freshness_tokens import (
     HEADER,
     FreshnessTokenExpired,
@@ -24,6 +26,7 @@ from relay_server.common.freshness_tokens import (
 from relay_server.fleet import http as module
 from relay_server.fleet.order import Order, TaskOutcome, TaskResult
 from relay_server.fleet.service import FleetPlan
+from relay_server.http.site import BoundedRequest
 from tests.worlds.http_client import HOST, Transport, World, parse
 
 HERE = "/api/v1/fleet"
@@ -253,6 +256,18 @@ def test_an_order_is_dated_by_the_moment_it_gives_back(world: World, fake: FakeF
         answer = world.ask("POST", HERE, order, **ANN, **dated)
         assert (answer.status, answer.headers[HEADER]) == (status, MOMENTS.now())
     assert fake.earliest_sent == [1000, None, None]
+
+
+def test_an_order_of_another_relay_is_as_much_older_as_that_says(
+    world: World, fake: FakeFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The token was made for that relay, after the order was sent."""
+    ann = Principal(1, "ann", "main", False, 2, None)
+    client = msgspec.structs.replace(ForwardedClient.of(ann, "192.0.2.1"), older_ns=400)
+    monkeypatch.setattr(BoundedRequest, "forwarded_client", client)
+    fake.over.callback(None)
+    world.ask("POST", HERE, SET, **ANN, **{HEADER: MOMENTS.now()})
+    assert fake.earliest_sent == [600]
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,28 @@ def test_no_bytes_are_lost_in_either_direction(terminal: SerialTerminal, seen: S
     assert terminal.reads(len(sent)) == sent
 
 
+def test_a_port_has_one_user(
+    terminal: SerialTerminal, seen: Seen, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two would each get a part of the lines."""
+    seen.is_open()
+    errors: list[str] = []
+
+    def printed(words: str) -> bool:
+        errors.append(capsys.readouterr().err)
+        return words in "".join(errors)
+
+    second = Seen(terminal.path)
+    wait_for("the problem is in the log", lambda: printed("exclusively lock port"))
+    terminal.send(b"whole\n")
+    wait_for("a line", lambda: seen.lines == [b"whole"])
+    assert second.open == []
+    seen.port.close()
+    second.is_open()
+    wait_for("that is in the log too", lambda: printed(f"{terminal.path}: open\n"))
+    second.port.close()
+
+
 def test_device_that_comes_back_is_opened_again(
     terminal: SerialTerminal, seen: Seen, capsys: pytest.CaptureFixture[str]
 ) -> None:
