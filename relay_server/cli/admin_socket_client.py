@@ -28,7 +28,7 @@ _ORDER_SECONDS = 20.0
 _UNSURE_SECONDS = 5.0
 """The relay may never answer an order to stop that it has not answered by then."""
 
-_NO_RELAY = "no relay runs on this data folder; start one with 'switchboard serve', or give --data"
+_NO_RELAY = "no relay runs on the data folder {folder}; start one with 'switchboard serve', or give --data"
 _PATH_BYTES = 107
 """Longest path of a Unix socket (unix(7): sun_path without its NUL)."""
 
@@ -90,7 +90,7 @@ def ask_status(folder: Path) -> dict[str, Any]:
     try:
         status, body = _request(folder, "GET", "/status", _STATUS_SECONDS)
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
-        raise Unavailable(_NO_RELAY) from None
+        raise Unavailable(_NO_RELAY.format(folder=folder.absolute())) from None
     except (PermissionError, OSError, http.client.HTTPException) as error:
         raise _no_answer_error(error, _STATUS_SECONDS) from None
     try:
@@ -131,7 +131,7 @@ def send_order(
             answer = connection.getresponse()
         body = answer.read(_ANSWER_BYTES)
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
-        raise NoRelay(_NO_RELAY) from None
+        raise NoRelay(_NO_RELAY.format(folder=folder.absolute())) from None
     except (OSError, http.client.HTTPException) as error:
         raise _no_answer_error(error, _ORDER_SECONDS) from None
     finally:
@@ -161,7 +161,7 @@ def send_fleet_order(folder: Path, order: dict[str, Any], realm: str) -> Iterato
             while line := answer.readline(_ANSWER_BYTES):
                 yield _parse_line(line)
         except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
-            raise Unavailable(_NO_RELAY) from None
+            raise Unavailable(_NO_RELAY.format(folder=folder.absolute())) from None
         except (OSError, http.client.HTTPException) as error:
             raise _no_answer_error(error, _LINE_SECONDS) from None
     finally:

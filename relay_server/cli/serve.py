@@ -557,7 +557,8 @@ def _ready(relay: Relay, link: str | None) -> None:
     if link is not None:
         password = ["switchboard", "--data", str(relay.settings.data), "user", "passwd", "admin"]
         click.echo(
-            f"No user can log in yet. Open this once, within an hour, as 'admin' "
+            f"No user of the data folder {relay.settings.data.absolute()} can log in yet. "
+            f"Open this once, within an hour, as 'admin' "
             f"(for a password: {shlex.join(password)}):\n  {link}"
         )
     click.echo(f"READY http={relay.http_port} robots={relay.robots_port}")

@@ -73,7 +73,10 @@ class SerialPort:
 
         :raises ModuleNotFoundError: pyserial is not installed
         """
-        importlib.import_module("serial")  # a thread could not raise it to the caller
+        try:
+            importlib.import_module("serial")  # a thread could not raise it to the caller
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError("pyserial is missing; install the extra 'devices'") from None
         self._reader.start()
         self._writer.start()
 

@@ -17,6 +17,9 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
+ANSWER_SECONDS = 10.0
+"""Seconds that each command's answer is waited for at the end of the input."""
+
 
 def main() -> None:
     """Run a class until the input ends.
@@ -44,8 +47,9 @@ def main() -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         _send(own, {"settings": settings})
         _send(own, {"stopped": False})
-        threading.Thread(target=_print_messages, args=(own,), daemon=True).start()
-        threading.Thread(target=_send_commands, args=(own, sys.stdin), daemon=True).start()
+        answers = threading.Semaphore(0)
+        threading.Thread(target=_print_messages, args=(own, answers), daemon=True).start()
+        threading.Thread(target=_send_commands, args=(own, sys.stdin, answers), daemon=True).start()
         code = host.wait()
     raise SystemExit(code)
 
@@ -54,20 +58,26 @@ def _send(connection: socket.socket, message: dict[str, Any]) -> None:
     connection.sendall(json.dumps(message).encode() + b"\n")
 
 
-def _send_commands(connection: socket.socket, lines: Iterable[str]) -> None:
+def _send_commands(connection: socket.socket, lines: Iterable[str], answers: threading.Semaphore) -> None:
+    sent = 0
     with suppress(OSError):
         for number, line in enumerate(lines, 1):
+            if not line.strip():
+                continue
             try:
                 command = json.loads(line)
             except ValueError as error:
                 _print(f"this is not JSON: {error}")
                 continue
             _send(connection, {"command": command, "number": number, "sender": 1})
+            sent += 1
+        for _ in range(sent):
+            answers.acquire(timeout=ANSWER_SECONDS)
         # The module ends as it would without its runner.
         connection.shutdown(socket.SHUT_WR)
 
 
-def _print_messages(connection: socket.socket) -> None:
+def _print_messages(connection: socket.socket, answers: threading.Semaphore) -> None:
     with suppress(OSError):
         for line in connection.makefile():
             message = json.loads(line)
@@ -75,6 +85,7 @@ def _print_messages(connection: socket.socket) -> None:
                 _print(f"feedback: {json.dumps(message['feedback'])}")
             elif "answer" in message:
                 _print(f"answer: {message['error'] or 'done'}")
+                answers.release()
 
 
 def _print(line: str) -> None:

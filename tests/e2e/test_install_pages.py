@@ -23,7 +23,7 @@ STAYS = r"switchboard serve |switchboard-robot run "
 """Programs that run until they are ended."""
 NOT_RUN = (
     r"python3 -m venv|export PATH=|pip install |source |pg_dump|systemctl|useradd|install -|chown|runuser|echo |"
-    r"cp .*(/etc|/var)/"
+    r"(cp|mv) .*(/etc|/var)/"
 )
 """What installs packages and changes the machine."""
 NAME = "robots.example.org"

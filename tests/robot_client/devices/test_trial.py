@@ -38,6 +38,21 @@ def trial(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     )
 
 
+def test_commands_of_a_pipe_are_answered_before_it_ends(tmp_path: Path) -> None:
+    with trial(tmp_path, "gripper:Gripper", json.dumps({"width": 80})) as made:
+        out, err = made.communicate("50\n\nwide\n90\n", timeout=PATIENCE)
+    assert made.returncode == 0, err
+    assert out.count("not JSON") == 1
+    assert "answer: done" in out
+    assert "answer: it opens 80 mm at most" in out
+
+
+def test_settings_that_are_not_json_are_refused_in_words(tmp_path: Path) -> None:
+    with trial(tmp_path, "gripper:Gripper", "{port: 1}") as made:
+        _, err = made.communicate(timeout=PATIENCE)
+    assert (made.returncode, err.startswith("the settings are not JSON: ")) == (1, True)
+
+
 @pytest.mark.parametrize("by_signal", [False, True])
 def test_a_class_takes_commands_until_the_input_ends_or_a_signal(tmp_path: Path, by_signal: bool) -> None:
     with trial(tmp_path, "gripper:Gripper", json.dumps({"width": 80})) as made:
