@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -226,10 +227,9 @@ class Watched:
         receivers = []
         for relay in places:
             share = count // len(places)
-            each = Receivers(folder, relay.http_port, share, self._request, self._subscribe, every_ms=1)
+            each = self._receivers(folder, relay, share)
             stack.callback(each.stop)
             receivers.append(each)
-            self._loop.turn()  # answers pings
         self._warm(receivers, count)
         messages = int(seconds * RATE)
         began = time.monotonic()
@@ -241,6 +241,16 @@ class Watched:
             came = self._wait_for(receivers, messages * count)
         assert came == messages * count, f"{came} deliveries of {messages * count}"
         return watch.seconds * 1e6 / came
+
+    def _receivers(self, folder: Path, relay: ClusterRelay, count: int) -> Receivers:
+        """So many viewers at a relay. They take seconds to connect, in which the client that watches answers pings."""
+        with ThreadPoolExecutor(1) as pool:
+            starting = pool.submit(
+                Receivers, folder, relay.http_port, count, self._request, self._subscribe, every_ms=1
+            )
+            while not starting.done():
+                self._loop.turn(0.1)
+            return starting.result()
 
     def _warm(self, receivers: list[Receivers], count: int) -> None:
         """Until one message has come to all."""
