@@ -25,6 +25,7 @@ from bench.child import Child
 from bench.cpu import measured, resident
 from bench.hop import SMALL, WINDOW_SMALL, Hop, text_message
 from bench.latency import delays
+from bench.light_fleet import PERIOD
 from bench.light_fleet import TOPIC as STATE
 from bench.messages import STRING, text_of
 from bench.native import Receivers
@@ -45,7 +46,7 @@ NAME = "fleet.example.org"
 RATE = 100.0
 SIZE = 1000
 USERS = 20
-A_SECOND = 25
+A_SECOND = 15
 """Robots that connect in a second, and then clients: what two cores can take beside the simulated ones."""
 
 
@@ -374,7 +375,7 @@ def fleet(folder: Path, relays: list[ClusterRelay], url: str, options: Options) 
     finally:
         light.stop()
     moved = (count + 2) // 3
-    note = f"{count} robots publish {STATE} once a second, each to one client; {messages / seconds:.0f} messages/s"
+    note = f"{count} robots publish {STATE} every {PERIOD:g} s, each to one client; {messages / seconds:.0f} messages/s"
     what = f"{count} robots and {count} clients at three relays"
     each_ms = 1e3 / count
     return [

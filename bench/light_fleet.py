@@ -2,8 +2,8 @@
 
 FILE is JSON: ``robots`` (``name``, ``key`` in base64, ``dials``: ports of relays in order), ``clients`` (``ports`` of
 relays in order, ``path``, ``token``), and ``seconds``, over which first the robots and then the clients connect. All
-connect again to the next port when a link ends. A robot publishes :data:`TOPIC` once a second while it is subscribed.
-For each line of standard input the process prints what is connected; it ends with standard input.
+connect again to the next port when a link ends. A robot publishes :data:`TOPIC` every :data:`PERIOD`
+seconds while it is subscribed. For each line of standard input the process prints what is connected; it ends with standard input.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from relay_protocol import PROTOCOL_VERSION, identity, jsontext, link
 from relay_protocol.frames import encode_sample
 
 TOPIC = "/state"
-PERIOD = 1.0
+PERIOD = 5.0
 FIRST_REDIAL_SECONDS, LAST_REDIAL_SECONDS = 1.0, 8.0
 """Most seconds before a connection is tried again, the first time and after several failures."""
 

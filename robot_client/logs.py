@@ -26,7 +26,7 @@ from relay_protocol.text import escape_unprintable
 MAX_LINE = 2000
 """Characters of the text of a log line."""
 
-LIBRARIES = ("twisted.internet", "twisted.protocols", "stdout")
+LIBRARIES = ("twisted.internet", "twisted.protocols", "log_legacy", "stdout")
 """Loggers of which only warnings are written."""
 
 

@@ -44,7 +44,12 @@ PATIENCE = 600.0
 """Most seconds to wait for a condition, such as a program that is ready."""
 RELAY = "[server]"
 ROBOT, ROBOT_WITH_ROS = "[robot]", "[robot,ros]"
-LEFT_OUT = {"PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "PIP_REQUIRE_VIRTUALENV"}
+LEFT_OUT = {"PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "PIP_REQUIRE_VIRTUALENV"} | {
+    "LD_LIBRARY_PATH",
+    "AMENT_PREFIX_PATH",
+    "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+}
+"""Variables that would lead into the environment which runs this; those of ROS's wheels among them."""
 
 
 def say(line: str) -> None:

@@ -76,18 +76,26 @@ class App:
         :param create: whether to create the file of SQLite
         :raises Unavailable: there is no such file, or the database cannot be reached, or was written by a newer version
         """
-        if not create and self.given_url is None and _is_missing(self._file):
-            raise Unavailable(
-                f"there is no database in the data folder {self.data.absolute()}; give the relay's data folder with "
-                "--data, or the database with SWITCHBOARD_DB ('switchboard serve' and 'switchboard db upgrade' "
-                "create one)"
-            )
+        if not create:
+            self.check_database()
         database = Database(self.database_url)
         try:
             database.upgrade()
             yield database
         finally:
             database.close()
+
+    def check_database(self) -> None:
+        """Find out whether there is a database, where that is a file.
+
+        :raises Unavailable: there is none
+        """
+        if self.given_url is None and _is_missing(self._file):
+            raise Unavailable(
+                f"there is no database in the data folder {self.data.absolute()}; give the relay's data folder with "
+                "--data, or the database with SWITCHBOARD_DB ('switchboard serve' and 'switchboard db upgrade' "
+                "create one)"
+            )
 
     @contextmanager
     def reading(self) -> Iterator[Session]:

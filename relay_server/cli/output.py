@@ -50,8 +50,8 @@ def format_time(at: float | None) -> str:
 def format_duration(seconds: float) -> str:
     """A time span in its two largest units."""
     left, parts = int(seconds), []
-    for unit in reversed(_UNITS):
-        count, left = divmod(left, _UNITS[unit])
+    for unit, length in (("d", 86400), ("h", 3600), ("min", 60), ("s", 1)):
+        count, left = divmod(left, length)
         if count:
             parts.append(f"{count} {unit}")
     return " ".join(parts[:2]) or "0 s"

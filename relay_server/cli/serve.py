@@ -635,6 +635,7 @@ def backup(app: App, folder: Path, as_json: bool) -> None:
     A relay may run meanwhile. Recordings and files of robots are not copied. FOLDER is a complete data folder: to
     restore it, start a relay with it.
     """
+    app.check_database()
     copy_data(app.data, app.database_url, folder)
     print_result(as_json, {"folder": str(folder)}, f"Copied the database and the relay's name into {folder}.")
 

@@ -201,17 +201,19 @@ class SerialPort:
         if was_open is not (device is not None):
             self._connected(device is not None)
         if device is not None and self._problem:
-            self._print("open")
+            self._print(f"{self._path}: open")
             self._problem = ""
 
     def _report(self, problem: str) -> None:
         """Write a problem to the module's log, once."""
         if problem != self._problem:
-            self._print(problem)
+            # A level as Python's logging writes it, which the log of modules understands.
+            self._print(f"WARNING: {self._path}: {problem}")
         self._problem = problem
 
-    def _print(self, problem: str) -> None:
-        print(f"{self._path}: {problem}", file=sys.stderr, flush=True)
+    @staticmethod
+    def _print(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
 
 
 class SerialDevice(Module):

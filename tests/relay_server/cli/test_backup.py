@@ -70,7 +70,7 @@ def test_a_failed_backup_leaves_nothing(data: Path, tmp_path: Path, missing: str
     (data / "switchboard.db").unlink()
     done = run(source, "db", "backup", str(tmp_path / "copy"))
     assert done.exit_code == 3
-    assert "can't be opened" in done.stderr
+    assert f"there is no database in the data folder {source}" in done.stderr
     assert not (tmp_path / "copy").exists()
     assert not (source / "switchboard.db").exists()
 

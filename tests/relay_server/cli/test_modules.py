@@ -109,7 +109,7 @@ def test_processes_of_a_robot_that_went_offline_are_stale(
     now[0] += 65.0
     answer(relay, offline, 503)
     stale = next(turns)
-    assert stale[0].title == "STALE, 1 m 5 s old: robot rover is offline"
+    assert stale[0].title == "STALE, 1 min 5 s old: robot rover is offline"
     assert stale[1:] == [title, *fresh]
     answer(relay, found)
     assert "STALE" not in next(turns)[0].title

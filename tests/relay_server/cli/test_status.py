@@ -46,7 +46,7 @@ def test_status_shows_robots_and_their_users(live: Any, relay: Any) -> None:
     answer = _rover()
     relay.answer = (200, json.dumps(answer).encode())
     head, columns, _, row = live.ok("status").splitlines()
-    assert head == "Relay switchboard 0.1.0, up 1 h 2 m"
+    assert head == "Relay switchboard 0.1.0, up 1 h 2 min"
     assert dict(zip(_words(columns), _words(row), strict=True)) == {
         "robot": "rover",
         "state": "in use",
@@ -104,7 +104,7 @@ def test_status_of_one_robot_lists_its_clients(live: Any, relay: Any) -> None:
     relay.answer = (200, json.dumps(answer).encode())
     lines = [_words(each) for each in live.ok("status", "rover").splitlines()]
     assert ["user", "from", "for", "watches", "round trip", "to the robot", "link", "drops"] in lines
-    assert ["ann", "192.0.2.7", "2 h 1 m", "–", "1.2 ms", "2.5 ms", "good, 2 lost", "3"] in lines
+    assert ["ann", "192.0.2.7", "2 h 1 min", "–", "1.2 ms", "2.5 ms", "good, 2 lost", "3"] in lines
     assert ["bob", "192.0.2.8", "3 h 2 m", "/eye", "–", "–", "–", "–"] in lines
     assert not any("tank" in each or "eve" in each for each in lines)
     assert [each["name"] for each in live.json("status", "rover")["robots"]] == ["rover"]
@@ -221,10 +221,10 @@ def test_a_folder_with_a_long_path_works(
         (0, "0 s"),
         (0.9, "0 s"),
         (59, "59 s"),
-        (60, "1 m"),
-        (3725, "1 h 2 m"),
+        (60, "1 min"),
+        (3725, "1 h 2 min"),
         (90_000, "1 d 1 h"),
-        (1209600, "2 w"),
+        (1209600, "14 d"),
     ],
 )
 def test_spans_are_read_in_two_units(seconds: float, text: str) -> None:
