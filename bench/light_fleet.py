@@ -3,7 +3,8 @@
 FILE is JSON: ``robots`` (``name``, ``key`` in base64, ``dials``: ports of relays in order), ``clients`` (``ports`` of
 relays in order, ``path``, ``token``), and ``seconds``, over which first the robots and then the clients connect. All
 connect again to the next port when a link ends. A robot publishes :data:`TOPIC` every :data:`PERIOD`
-seconds while it is subscribed. For each line of standard input the process prints what is connected; it ends with standard input.
+seconds while it is subscribed. For each line of standard input the process prints what is connected; it ends with
+standard input.
 """
 
 from __future__ import annotations

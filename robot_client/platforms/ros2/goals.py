@@ -8,13 +8,13 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.action import ActionClient
 from rclpy.serialization import serialize_message
 from twisted.internet.defer import Deferred
 from unique_identifier_msgs.msg import UUID
 
 from relay_protocol.errors import Unavailable
 from robot_client.platforms.base import ABORTED, CANCELED, NOT_STARTED, SUCCEEDED, GoalOutcome, OnSample
+from robot_client.platforms.ros2.action_client import GoalClient
 from robot_client.platforms.ros2.errors import error_text
 from robot_client.platforms.ros2.executor import ReactorBridge, Spinner
 from robot_client.platforms.ros2.graph import endpoint_ids
@@ -36,6 +36,12 @@ GONE_SECONDS = 1.0
 
 CANCELLED_ACCEPT_SECONDS = 5.0
 """Seconds in which a server must accept a goal that was cancelled meanwhile."""
+
+RESULT_SECONDS = 1.0
+"""Seconds after its end in which the result of a goal must arrive, before it is requested again."""
+
+RESULT_REQUESTS = 5
+"""Requests for one result, after which the goal is given up. Servers of rclcpp and rclpy keep results for 10 s."""
 
 MAX_UNANSWERED = 8
 """Most unanswered cancel requests for one goal; rclpy would keep them for ever."""
@@ -77,7 +83,7 @@ class RosGoals:
             raise Unavailable(f"{MAX_GOALS} goals are open on this robot; wait until some end")
         client = self._clients.get((action, type))
         if client is None:
-            ros = FeedbackSafeClient(self.spinner.node, kind, action)
+            ros = GoalClient(self.spinner.node, kind, action)
             client = self._clients[action, type] = _ActionClient(ros, action)
         goal = RosGoal(self, client, message, on_feedback)
         client.goals.add(goal)
@@ -130,25 +136,6 @@ class RosGoals:
             self._check_timer = self.clock.callLater(CHECK_INTERVAL, self._check)
 
 
-class FeedbackSafeClient(ActionClient):  # type: ignore[misc]  # rclpy is untyped
-    """An action client that passes feedback on after the result has arrived.
-
-    Feedback and results are separate endpoints, and an executor takes one of each at a time: rclpy would
-    drop feedback that the result has overtaken. The user of a goal ends its feedback by
-    :meth:`drop_feedback`.
-    """
-
-    def _remove_pending_result_request(self, future: Any) -> None:
-        callbacks = dict(self._feedback_callbacks)
-        super()._remove_pending_result_request(future)
-        for goal_id, callback in callbacks.items():
-            self._feedback_callbacks.setdefault(goal_id, callback)
-
-    def drop_feedback(self, goal_id: bytes) -> None:
-        """Pass no more feedback of a goal on."""
-        self._feedback_callbacks.pop(goal_id, None)
-
-
 class _ActionClient:
     """The client that all goals of one action share."""
 
@@ -182,13 +169,17 @@ class RosGoal:
         self._cancelled = False
         """Set on the reactor's thread; also read on the executor's."""
         self._handle: Any = None
+        self._ended_at: float | None = None
+        """When it had ended, by its server's word, or when its result was requested since."""
+        self._result_requests = 1
         self._servers: frozenset[bytes] = frozenset()
         self._since = self._seen = goals.clock.seconds()
         self._pending: list[Any] = []
         self._cancel_futures: deque[Any] = deque()
         self._executor_handle: Any = None
+        self._told_end = False
         self._abandoned = False
-        """Used on the executor's thread, like the two before: the reactor's thread gets no events of an
+        """Used on the executor's thread, like the three before: the reactor's thread gets no events of an
         abandoned goal."""
 
     def start(self) -> None:
@@ -244,6 +235,17 @@ class RosGoal:
                 self._lose(ABORTED, f"the action {action} disappeared before the goal ended")
         elif self._cancelled and self._state is _State.SENT and now - self._since > CANCELLED_ACCEPT_SECONDS:
             self._lose(NOT_STARTED, f"the action {action} did not answer, and the goal was cancelled")
+        elif (
+            self._state is _State.ACCEPTED
+            and self._ended_at is not None
+            and now - self._ended_at > RESULT_SECONDS
+        ):
+            if self._result_requests == RESULT_REQUESTS:
+                self._lose(ABORTED, f"the goal has ended, but the action {action} does not send its result")
+                return
+            self._result_requests += 1
+            self._ended_at = now
+            self._goals.spinner.call(self._request_result)
 
     def _lose(self, status: int, reason: str) -> None:
         """Give up a goal that may still be executed."""
@@ -264,17 +266,30 @@ class RosGoal:
             return
         self._pending.append(future)
         future.add_done_callback(self._guarded(self._response_arrived))
+        self._client.ros.watch(self.id, self._status_arrived)
+
+    def _status_arrived(self, status: int) -> None:
+        """The server has it, also if its answer is late, or lost."""
+        answer = self._pending[0]
+        if self._executor_handle is None and not answer.done():
+            self._client.ros.accept(self.id, answer)
+        if status in _ENDS and not self._told_end:
+            self._told_end = True
+            self._goals.bridge.put(self._ended_by_status, status)
 
     def _response_arrived(self, future: Any) -> None:
         handle = future.result()
         if handle.accepted:
-            result = handle.get_result_async()
-            self._pending.append(result)
-            result.add_done_callback(self._guarded(self._result_arrived))
             self._executor_handle = handle
+            self._request_result()
             if self._abandoned:
                 handle.cancel_goal_async()
         self._goals.bridge.put(self._responded, handle)
+
+    def _request_result(self) -> None:
+        result = self._executor_handle.get_result_async()
+        self._pending.append(result)
+        result.add_done_callback(self._guarded(self._result_arrived))
 
     def _request_cancel(self) -> None:
         if len(self._cancel_futures) == MAX_UNANSWERED:
@@ -307,8 +322,7 @@ class RosGoal:
         return run
 
     def _forget(self) -> None:
-        if self._handle is not None:
-            self._client.ros.drop_feedback(bytes(self._handle.goal_id.uuid))
+        self._client.ros.forget(self.id)
         for future in (*self._pending, *self._cancel_futures):
             if not future.done():
                 future.cancel()  # otherwise rclpy keeps it for ever
@@ -319,7 +333,7 @@ class RosGoal:
         if self._state is _State.ENDED and self._goals.closed:
             return  # a cancel request would no longer be sent
         if self._state is _State.ENDED:
-            self._goals.spinner.call(self._client.ros.drop_feedback, bytes(handle.goal_id.uuid))
+            self._goals.spinner.call(self._client.ros.forget, self.id)
             if handle.accepted:  # accepted after it was given up: nothing else would end it
                 self._goals.spinner.call(handle.cancel_goal_async)
         elif not handle.accepted:
@@ -328,6 +342,9 @@ class RosGoal:
             self._state, self._handle = _State.ACCEPTED, handle
             if self._cancelled:
                 self._goals.spinner.call(self._request_cancel)
+
+    def _ended_by_status(self, _status: int) -> None:
+        self._ended_at = self._goals.clock.seconds()
 
     def _pass_feedback(self, body: bytes) -> None:
         if self._state is not _State.ENDED and self._on_feedback is not None:

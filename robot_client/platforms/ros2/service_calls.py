@@ -22,6 +22,10 @@ DISCOVERY_POLL = 0.02
 DISCOVERY_SECONDS = 3.0
 """Seconds in which a service of the graph must be reached. A busy machine discovers in one to two."""
 
+SETTLE_SECONDS = 0.1
+"""Seconds for which a new client does not send. The service may discover the reader of its answers later than the
+client discovers the service, and then its answer is lost (https://github.com/ros2/rmw_fastrtps/issues/842)."""
+
 CHECK_INTERVAL = 0.25
 GONE_SECONDS = 1.0
 """Seconds for which a called service may be unreachable before the call is given up."""
@@ -34,11 +38,13 @@ class _ServiceClient:
     """A client of a service.
 
     :param best_effort: whether its reliability is best effort, because the service's is
+    :param created_at: seconds
     """
 
-    def __init__(self, client: Any, best_effort: bool) -> None:
+    def __init__(self, client: Any, best_effort: bool, created_at: float) -> None:
         self.client = client
         self.best_effort = best_effort
+        self.created_at = created_at
         self.used_at = 0.0
         """When it was last used, seconds."""
 
@@ -83,8 +89,8 @@ class RosServiceCalls:
             message = deserialize_message(request, kind.Request)
         except Exception:
             raise Invalid(f"the arguments for {service} are not a request of type {type}") from None
-        client = self._client(service, type, kind)
-        call = _RosCall(self, service, client, message, timeout, self._pending.discard, check)
+        known = self._client(service, type, kind)
+        call = _RosCall(self, service, known, message, timeout, self._pending.discard, check)
         self._pending.add(call)
         call.start()
         return call.result
@@ -107,12 +113,12 @@ class RosServiceCalls:
             self.node.destroy_client(known.client)
         self._clients.clear()
 
-    def _client(self, service: str, type: str, kind: Any) -> Any:
+    def _client(self, service: str, type: str, kind: Any) -> _ServiceClient:
         known = self._clients.get((service, type))
         if known is None or not known.client.service_is_ready():
             known = self._matching_client(service, type, kind, known)
         known.used_at = self.clock.seconds()
-        return known.client
+        return known
 
     def _matching_client(
         self, service: str, type: str, kind: Any, known: _ServiceClient | None
@@ -126,7 +132,7 @@ class RosServiceCalls:
                 return known
             self.node.destroy_client(known.client)
         client = self.node.create_client(kind, service, qos_profile=qos.for_service(best_effort))
-        created = self._clients[service, type] = _ServiceClient(client, best_effort)
+        created = self._clients[service, type] = _ServiceClient(client, best_effort, self.clock.seconds())
         return created
 
     def servers(self, service: str) -> list[Any]:
@@ -141,16 +147,17 @@ class _RosCall:
         self,
         calls: RosServiceCalls,
         service: str,
-        client: Any,
+        known: _ServiceClient,
         request: Any,
         timeout: float,
         on_done: Callable[[_RosCall], None],
         check: Check | None,
     ) -> None:
-        self.client = client
+        self.client = known.client
         self.result: Deferred[bytes] = Deferred(lambda _: self._end())
         self._service = service
         self._request = request
+        self._not_before = known.created_at + SETTLE_SECONDS
         self._calls = calls
         self._timeout = timeout
         self._on_done = on_done
@@ -171,9 +178,10 @@ class _RosCall:
         self.result.errback(reason)
 
     def _discover(self) -> None:
-        if self.client.service_is_ready():
+        is_ready = self.client.service_is_ready()
+        if is_ready and self._calls.clock.seconds() >= self._not_before:
             self._send()
-        elif self._calls.clock.seconds() - self._began > DISCOVERY_SECONDS:
+        elif not is_ready and self._calls.clock.seconds() - self._began > DISCOVERY_SECONDS:
             reason = qos.unsafe_service(self._calls.servers(self._service))
             reason = reason or "its node is gone or silent"
             self.give_up(NotFound(f"the service {self._service} can't be reached; {reason}"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import secrets
 import time
@@ -29,7 +28,11 @@ from robot_client.platforms.ros2.types import Types
 from robot_client.twisted_types import DelayedCall, ReactorClock
 
 LINGER = 0.5
-"""Seconds between the end of a publisher and its destruction."""
+"""Seconds between the end of a publisher and its destruction, and between later looks whether it can be destroyed."""
+
+LONGEST_LINGER = 5.0
+"""Seconds for which a publisher waits for subscribers that have not confirmed its messages, because they have not
+discovered it yet, or are gone."""
 
 REPLACE_POLL = 0.02
 REPLACE_SECONDS = 1.0
@@ -496,8 +499,17 @@ class LingeringPublishers:
         self._timers: dict[Any, DelayedCall] = {}
 
     def add(self, publisher: Any) -> None:
-        """Destroy this publisher after :data:`LINGER`."""
-        self._timers[publisher] = self._clock.callLater(LINGER, self._destroy, publisher)
+        """Destroy this publisher after :data:`LINGER`, and once its messages are acknowledged."""
+        end = self._clock.seconds() + LONGEST_LINGER
+        self._timers[publisher] = self._clock.callLater(LINGER, self._destroy_acknowledged, publisher, end)
+
+    def _destroy_acknowledged(self, publisher: Any, end: float) -> None:
+        if self._clock.seconds() >= end or _is_acknowledged(publisher, 0.0):
+            self._destroy(publisher)
+        else:
+            self._timers[publisher] = self._clock.callLater(
+                LINGER, self._destroy_acknowledged, publisher, end
+            )
 
     def destroy_other_types(self, topic: str, message_class: Any) -> None:
         """Destroy publishers of this topic with another type: some middleware allows one type per topic and
@@ -516,10 +528,17 @@ class LingeringPublishers:
         for publisher, timer in list(self._timers.items()):
             timer.cancel()
             left = max(0.0, deadline - self._clock.seconds())
-            with contextlib.suppress(Exception):  # not supported by every middleware
-                publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
+            _is_acknowledged(publisher, left)
             self._destroy(publisher)
 
     def _destroy(self, publisher: Any) -> None:
         del self._timers[publisher]
         self._node.destroy_publisher(publisher)
+
+
+def _is_acknowledged(publisher: Any, timeout: float) -> bool:
+    """Whether all subscribers have confirmed all messages within some seconds, as far as the middleware knows."""
+    try:
+        return bool(publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout * 1e9))))
+    except Exception:
+        return True  # not supported by every middleware

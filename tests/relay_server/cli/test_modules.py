@@ -40,7 +40,7 @@ def test_states_of_now_are_listed_without_words(relay: FakeRelay, live: Cli) -> 
 
 def test_last_states_of_a_robot_that_is_offline_have_their_age(relay: FakeRelay, live: Cli) -> None:
     shown = listed(relay, live, BASE, online=False, current=False)
-    assert shown.startswith("Robot rover is offline; last reported 5 m")
+    assert shown.startswith("Robot rover is offline; last reported 5 min")
     assert "running" in shown
     # Its process is not known now, and for how long it has been running neither.
     assert "4711" not in shown
@@ -54,7 +54,7 @@ def test_last_states_of_a_robot_that_is_offline_have_their_age(relay: FakeRelay,
             "offline, and has never reported its modules",
         ),
         ({"current": False, "reported_at": None}, "online, and has never reported its modules"),
-        ({"current": False}, "online, and has not reported its modules yet; last reported 5 m"),
+        ({"current": False}, "online, and has not reported its modules yet; last reported 5 min"),
         ({}, "Robot rover has no modules"),
         ({"online": False, "current": False}, "Robot rover had no modules"),
     ],

@@ -105,7 +105,7 @@ def test_status_of_one_robot_lists_its_clients(live: Any, relay: Any) -> None:
     lines = [_words(each) for each in live.ok("status", "rover").splitlines()]
     assert ["user", "from", "for", "watches", "round trip", "to the robot", "link", "drops"] in lines
     assert ["ann", "192.0.2.7", "2 h 1 min", "–", "1.2 ms", "2.5 ms", "good, 2 lost", "3"] in lines
-    assert ["bob", "192.0.2.8", "3 h 2 m", "/eye", "–", "–", "–", "–"] in lines
+    assert ["bob", "192.0.2.8", "3 h 2 min", "/eye", "–", "–", "–", "–"] in lines
     assert not any("tank" in each or "eve" in each for each in lines)
     assert [each["name"] for each in live.json("status", "rover")["robots"]] == ["rover"]
     assert "does not know a robot 'moon'" in live.fails("status", "moon")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import pytest
 import pytest_twisted
@@ -14,7 +15,9 @@ from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.link import MotionPolicy
 from robot_client.motion.goal_canceller import GoalCanceller
 from robot_client.platforms.base import ABORTED, CANCELED, NOT_STARTED, SUCCEEDED, GoalOutcome
+from robot_client.platforms.ros2 import goals
 from robot_client.platforms.ros2 import platform as ros2
+from robot_client.platforms.ros2.action_client import GoalClient
 from robot_client.platforms.ros2.goals import RosGoal
 from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.ros import Peer, until
@@ -85,6 +88,67 @@ async def test_cancelled_goal_ends_with_its_result(ros: Ros2Platform, peer: Peer
     status, body, _, _ = await wanted.end()
     assert status == CANCELED
     assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1]
+
+
+class LostAnswers:
+    """Loses answers of actions, as a server does that has not discovered the reader of an answer yet.
+
+    :param kinds: ``goal`` or ``result``, once for each answer that is lost
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *kinds: str) -> None:
+        self.left = list(kinds)
+        taken = GoalClient.take_data
+
+        def take(client: GoalClient) -> Any:
+            data = taken(client)
+            for kind in set(data) & set(self.left):
+                del data[kind]
+                self.left.remove(kind)
+            return data
+
+        monkeypatch.setattr(GoalClient, "take_data", take)
+
+
+@pytest.mark.parametrize("lost", [["goal"], ["result"], ["goal", "result", "result"]])
+@pytest_twisted.ensureDeferred
+async def test_goal_whose_answers_are_lost_ends_with_its_result(
+    ros: Ros2Platform, peer: Peer, lost: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """https://github.com/ros2/rmw_fastrtps/issues/842."""
+    await serve(ros, peer, "/count", "count")
+    answers = LostAnswers(monkeypatch, *lost)
+    wanted = SentGoal(ros, "/count", 5)
+    status, body, reason, _ = await wanted.end()
+    assert (status, reason, answers.left) == (SUCCEEDED, "", [])
+    assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1, 2, 3]
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_whose_result_never_arrives_is_given_up(
+    ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await serve(ros, peer, "/count", "count")
+    answers = LostAnswers(monkeypatch, *["result"] * 9)
+    monkeypatch.setattr(goals, "RESULT_SECONDS", 0.0)
+    status, body, reason, certain = await SentGoal(ros, "/count", 5).end()
+    assert (status, body, certain) == (ABORTED, None, False)
+    assert "does not send its result" in reason
+    assert len(answers.left) >= 9 - goals.RESULT_REQUESTS
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_that_was_given_up_is_cancelled_also_if_its_answer_is_lost(
+    ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await serve(ros, peer, "/forever", "forever")
+    answers = LostAnswers(monkeypatch, "goal")
+    before = len(peer.reported("ended", "/forever"))
+    wanted = SentGoal(ros, "/forever", 3)
+    await until(lambda: not answers.left or wanted.goal._handle)
+    wanted.goal.abandon("the robot is shutting down")
+    assert (await wanted.end()).reason == "the robot is shutting down"
+    await until(lambda: len(peer.reported("ended", "/forever")) > before)
 
 
 @pytest_twisted.ensureDeferred

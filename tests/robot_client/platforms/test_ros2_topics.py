@@ -18,7 +18,7 @@ from robot_client.motion.motion_control import MOTION_QOS
 from robot_client.motion.typed_topic import TypedTopic
 from robot_client.platforms.ros2 import executor
 from robot_client.platforms.ros2.platform import REFRESH_ALL_EVERY, Ros2Platform
-from robot_client.platforms.ros2.topics import RosPublisher
+from robot_client.platforms.ros2.topics import LINGER, LONGEST_LINGER, LingeringPublishers, RosPublisher
 from tests.robot_client.ros import Peer, until
 from tests.worlds.ros_endpoints import STAMPED, STRING, TWIST, Listener, node, seen
 
@@ -236,3 +236,35 @@ def test_errors_of_ros_have_no_source_location(ros: Ros2Platform, monkeypatch: p
     monkeypatch.setattr(ros._node, "create_publisher", refuse)
     with pytest.raises(Invalid, match=r"as std_msgs/msg/String: incompatible type$"):
         ros.advertise("/refused", STRING, False, None)
+
+
+class SlowSubscriber:
+    """A publisher of rclpy whose subscriber confirms messages after some looks, and its node.
+
+    :param looks: at which it has confirmed them
+    """
+
+    def __init__(self, looks: int) -> None:
+        self.looks = looks
+        self.destroyed: list[object] = []
+
+    def wait_for_all_acked(self, timeout: Any) -> bool:
+        self.looks -= 1
+        return self.looks <= 0
+
+    def destroy_publisher(self, publisher: object) -> None:
+        self.destroyed.append(publisher)
+
+
+@pytest.mark.parametrize(("looks", "seconds"), [(1, LINGER), (3, 3 * LINGER), (1000, LONGEST_LINGER)])
+def test_a_publisher_lives_until_its_subscribers_have_its_messages(
+    ros: Ros2Platform, looks: int, seconds: float
+) -> None:
+    """A subscriber that has not discovered it yet would never get them. It does not live for ever."""
+    clock, publisher = task.Clock(), SlowSubscriber(looks)
+    LingeringPublishers(publisher, clock).add(publisher)
+    clock.pump([LINGER / 2] * round(2 * (seconds / LINGER) - 1))
+    assert not publisher.destroyed
+    clock.advance(LINGER / 2)
+    assert publisher.destroyed == [publisher]
+    assert not clock.getDelayedCalls()
