@@ -166,7 +166,9 @@ class _Demo:
         link = await relay.login_link("admin")
         width = max(len(login.name) for login in self._logins)
         lines = [f"  {login.name:<{width}}  {login.password}   {login.may}" for login in self._logins]
-        click.echo("\n".join(["", "Users of this demo, with passwords that are new at each start:", *lines, ""]))
+        click.echo(
+            "\n".join(["", "Users of this demo, with passwords that are new at each start:", *lines, ""])
+        )
         click.echo(f"Log in as admin with this link, once:\n  {link}\n")
         if self._cluster is not None:
             click.echo(_relays_text(relay.url, self._others, self._cluster.database, self._settings.data))
