@@ -41,7 +41,7 @@ robot-conformance: ## check a robot that dials LISTEN=0.0.0.0:9091 (docs/referen
 
 bench: ## measure beside alternatives, all of it in two hours (options: BENCH='hop fanout', BENCH='--quick', BENCH='modules --strict', BASE=<commit>)
 	@scripts/setup.sh python web interfaces browser bench
-	$(BIN)/python -m bench $(BENCH) $(if $(BASE),--base $(BASE))
+	$(BIN)/python -m bench $(BENCH) $(BASE:%=--base %)
 
 stills: setup ## draw a still of every encoding of pictures as a viewer gets it: build/stills.png, to be looked at
 	@mkdir -p build

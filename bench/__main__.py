@@ -85,7 +85,10 @@ def arguments() -> argparse.Namespace:
         help="exit with 1 also if a bar is missed or a measurement is left out",
     )
     parser.add_argument(
-        "--base", metavar="COMMIT", help="measure this commit too, in turns, and print both and their ratios"
+        "--base",
+        metavar="COMMIT",
+        action="append",
+        help="measure this commit too, in turns, and print both and their ratios (again: further commits)",
     )
     parser.add_argument("--plot", type=Path, help="where a picture of the ratios goes (SVG)")
     return parser.parse_args()
@@ -135,7 +138,7 @@ def exit_code(rows: list[Row], missing: dict[str, str], *, strict: bool) -> int:
 
 def _without_base(options: list[str]) -> list[str]:
     kept = [each for each in options if not each.startswith("--base=")]
-    if "--base" in kept:
+    while "--base" in kept:
         at = kept.index("--base")
         del kept[at : at + 2]
     return kept

@@ -1,4 +1,4 @@
-"""Measures another commit beside this tree: in turns, on one machine, each with its own measurements."""
+"""Measures other commits beside this tree: in turns, on one machine, each with its own measurements."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ Figures = dict[str, tuple[str, float]]
 """Unit and figure by measurement and row."""
 
 
-def compare(base: str, options: list[str]) -> int:
-    """Measure a commit and this tree in turns, and print both figures and their ratios.
+def compare(bases: list[str], options: list[str]) -> int:
+    """Measure commits and this tree in turns, and print their figures, and the ratios of this tree to the last commit.
 
-    :param base: a commit; it is checked out and prepared below ``build/bench``
-    :param options: arguments of ``python -m bench``, the same for both
+    :param bases: commits; each is checked out and prepared below ``build/bench``
+    :param options: arguments of ``python -m bench``, the same for all
     :returns: the exit code: 1 if a measurement failed
     """
-    there = _prepared(base)
-    figures: dict[Path, list[Figures]] = {there: [], ROOT: []}
+    names = {_prepared(base): base for base in bases} | {ROOT: "this tree"}
+    figures: dict[Path, list[Figures]] = {tree: [] for tree in names}
     failed = 0
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         for turn in range(TURNS):
             for tree, found in figures.items():
                 path = Path(folder) / f"{turn}.json"
                 path.unlink(missing_ok=True)
-                print(f"=== {base if tree == there else 'this tree'}, {turn + 1} of {TURNS}", flush=True)
+                print(f"=== {names[tree]}, {turn + 1} of {TURNS}", flush=True)
                 command = [str(tree / ".venv/bin/python"), "-m", "bench", *options, "--json", str(path)]
                 failed |= subprocess.run(command, cwd=tree, check=False).returncode
                 found.append(_figures(json.loads(path.read_text())) if path.exists() else {})
-    _show(base, _medians(figures[there]), _medians(figures[ROOT]))
+    _show({names[tree]: _medians(found) for tree, found in figures.items()})
     return int(bool(failed))
 
 
@@ -86,16 +86,13 @@ def _medians(turns: list[Figures]) -> Figures:
     }
 
 
-def _show(base: str, before: Figures, after: Figures) -> None:
-    table = Table("what", base, "this tree", "ratio", title=f"medians of {TURNS} turns")
-    for name in dict.fromkeys([*before, *after]):
-        unit = (before.get(name) or after[name])[0]
-        old, new = before.get(name), after.get(name)
+def _show(columns: dict[str, Figures]) -> None:
+    """Print a table, with the ratio of the last column to the one before it."""
+    table = Table("what", *columns, "ratio", title=f"medians of {TURNS} turns")
+    for name in dict.fromkeys(name for each in columns.values() for name in each):
+        cells = [each.get(name) for each in columns.values()]
+        old, new = cells[-2:]
         ratio = new[1] / old[1] if old and new and old[1] else None
-        table.add_row(
-            name,
-            "" if old is None else f"{figure(old[1])} {unit}",
-            "" if new is None else f"{figure(new[1])} {unit}",
-            "" if ratio is None else f"{ratio:.2f}×",
-        )
+        texts = ["" if cell is None else f"{figure(cell[1])} {cell[0]}" for cell in cells]
+        table.add_row(name, *texts, "" if ratio is None else f"{ratio:.2f}×")
     Console(width=None if sys.stdout.isatty() else 180).print(table)

@@ -1,4 +1,4 @@
-"""``/healthz``, ``/readyz`` and ``/metrics``: the health of the relay, and its figures for Prometheus."""
+"""``/healthz``, ``/readyz``, ``/livez`` and ``/metrics``: the health of the relay, and its figures for Prometheus."""
 
 from __future__ import annotations
 
@@ -120,6 +120,18 @@ class StatusEndpoints:
     async def ready(self, request: ApiRequest) -> HealthInfo:
         if self._draining():
             raise Unavailable("this relay is being drained; use another one")
+        return {"status": "ok"}
+
+    @endpoint(
+        "GET",
+        "/livez",
+        tag="relay",
+        summary="Whether the relay still works",
+        more="It always says so. A relay that gives no answer for a minute hangs, and should be started again.",
+        returns="it does",
+        credential=Credential.NONE,
+    )
+    async def live(self, request: ApiRequest) -> HealthInfo:
         return {"status": "ok"}
 
     async def _check_database(self) -> None:

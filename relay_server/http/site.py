@@ -80,7 +80,7 @@ LARGE_BODIES = (
 )
 """Methods and beginnings of paths that take larger bodies than others, and their most bytes."""
 
-ROUTED = (b"api", b"oauth", b"healthz", b"readyz", b"metrics", b".well-known")
+ROUTED = (b"api", b"oauth", b"healthz", b"readyz", b"livez", b"metrics", b".well-known")
 """First path segments that do not belong to the portal."""
 
 

@@ -6,6 +6,7 @@ hello → challenge → prove → control link     enroll → enrolled → close
 
 from __future__ import annotations
 
+import random
 import secrets
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
@@ -58,6 +59,14 @@ LOGGED_ALERTS_A_SECOND = 1.0
 LOGGED_ALERTS_AT_ONCE = 20
 """Alerts of one connection that are logged: so many a second in the long run, and at once."""
 
+MOST_PROVING = 32
+"""Robots whose proof is checked at a time. Further ones are to come again: when thousands dial at once, those that are
+let in are registered soon, and the links of those that are registered stay alive."""
+
+BUSY = "this relay lets many robots in at the moment"
+BUSY_SECONDS = (2.0, 10.0)
+"""Least and most seconds after which a robot that was told so comes again."""
+
 FAILURES_OF_NETWORK = 1000
 """Failed proofs and enrolments allowed per network: many robots may dial from one address."""
 
@@ -91,6 +100,8 @@ class RobotLinkContext:
     wall: Callable[[], float]
     draining: Callable[[], bool] = lambda: False
     failures: LoginLimiter = field(init=False)
+    proving: set[RobotConnection] = field(default_factory=set)
+    """Connections whose proof is being checked."""
 
     def __post_init__(self) -> None:
         failures = LoginLimiter(self.seconds, FAILURES_OF_NETWORK, login_limiter.digest)
@@ -113,7 +124,11 @@ class HandshakeHandler(LinkHandler):
             if self._hello is None:
                 raise MalformedMessage("'prove' came before 'hello'")
             hello, self._hello = self._hello, None
-            self._run(self._prove(hello, message))
+            if len(self._context.proving) >= MOST_PROVING:
+                wait = random.uniform(*BUSY_SECONDS)  # noqa: S311  # no secret
+                self._connection.refuse(link.Refused(reason=BUSY, retry_after=wait))
+            else:
+                self._run(self._proving(hello, message))
         elif self._nonce:
             raise MalformedMessage(f"'{link.lower_tag(type(message).__name__)}' can't come after 'hello'")
         else:
@@ -143,6 +158,13 @@ class HandshakeHandler(LinkHandler):
         self._hello = hello
         self._nonce = secrets.token_bytes(identity.NONCE_BYTES)
         self._connection.send(link.Challenge(nonce=link.to_base64(self._nonce), relay=self._context.relay))
+
+    async def _proving(self, hello: link.Hello, proof: link.Prove) -> None:
+        self._context.proving.add(self._connection)
+        try:
+            await self._prove(hello, proof)
+        finally:
+            self._context.proving.discard(self._connection)
 
     async def _prove(self, hello: link.Hello, proof: link.Prove) -> None:
         context, connection = self._context, self._connection

@@ -85,6 +85,7 @@ class LinkProtocol(TwistedProtocol):
         self.owner = build_owner(self)
         self._clock = clock
         self._ping_timer: DelayedCall | None = None
+        self._ping_due = 0.0
         self._deadline: DelayedCall | None = None
         self._socket: socket.socket | None = None
         self._received = False
@@ -117,6 +118,7 @@ class LinkProtocol(TwistedProtocol):
         if self._deadline is not None and self.link.state not in _UNPROVEN:
             self._deadline.cancel()
             self._deadline = None
+            self._ping_due = self._clock.seconds()
             self._send_heartbeat()
         for event in events:
             if self._has_ended():
@@ -238,13 +240,17 @@ class LinkProtocol(TwistedProtocol):
         return LinkLost(reason)
 
     def _send_heartbeat(self) -> None:
-        try:
-            self.link.check_silence()
-        except PeerError as reason:
-            self.end(reason)
-            return
+        now = self._clock.seconds()
+        # If this process was busy or stopped, what the relay has sent meanwhile is not read yet.
+        if now - self._ping_due < self.link.heartbeat:
+            try:
+                self.link.check_silence()
+            except PeerError as reason:
+                self.end(reason)
+                return
         self.link.ping()
         self.flush()
+        self._ping_due = now + self.link.ping_every
         self._ping_timer = self._clock.callLater(self.link.ping_every, self._send_heartbeat)
 
     def ping_every(self, seconds: float) -> None:

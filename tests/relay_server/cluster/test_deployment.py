@@ -63,7 +63,8 @@ def test_pods_are_one_cluster(pod: Any) -> None:
     check(relay["args"], {each["name"]: each.get("value", "") for each in relay["env"]})
     assert pod["terminationGracePeriodSeconds"] > LEAVING
     assert relay["readinessProbe"]["httpGet"]["path"] == "/readyz"
-    assert StatusEndpoints.ready
+    assert relay["livenessProbe"]["httpGet"]["path"] == "/livez"
+    assert StatusEndpoints.ready and StatusEndpoints.live
     mounted = {each["name"] for each in relay["volumeMounts"]}
     (relays,) = kubernetes("StatefulSet")
     claims = {each["metadata"]["name"] for each in relays["spec"]["volumeClaimTemplates"]}

@@ -13,8 +13,15 @@ from relay_db import queries
 from relay_protocol import identity, limits, link
 from relay_protocol.frames import JSON_NUMBER, encode_json, encode_part, encode_sample, encode_video
 from relay_server.auth import login_limiter
+from relay_server.robots import link_handlers
 from relay_server.robots.connection import PINGS, REPLACED_SECONDS
-from relay_server.robots.link_handlers import FLAPPING_SECONDS, LOGGED_ALERTS_AT_ONCE, LONGEST_REPLACE_SECONDS
+from relay_server.robots.link_handlers import (
+    BUSY,
+    BUSY_SECONDS,
+    FLAPPING_SECONDS,
+    LOGGED_ALERTS_AT_ONCE,
+    LONGEST_REPLACE_SECONDS,
+)
 from relay_server.robots.registry import REPLACE_SECONDS
 from tests.worlds.robot_links import FINGERPRINT, KEY, Robot, RobotLinkWorld
 
@@ -390,6 +397,41 @@ async def test_a_silent_robot_is_cut_after_three_heartbeats(scene: RobotLinkWorl
     assert robot.transport.aborted
     assert scene.presence.control_link is None
     assert not [call for call in scene.world.clock.getDelayedCalls() if call.active()]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_relay_that_was_busy_does_not_take_robots_for_silent(scene: RobotLinkWorld) -> None:
+    """It has not read what they sent meanwhile. A robot that is silent after that is cut."""
+    robot = await scene.registered()
+    assert scene.presence is not None
+    scene.world.clock.advance(30)
+    assert scene.presence.control_link is not None
+    robot.pongs()
+    scene.world.clock.advance(30)
+    scene.world.clock.advance(2)
+    assert robot.transport.aborted
+    assert scene.presence.control_link is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_robots_that_dial_all_at_once_are_let_in_little_by_little(
+    scene: RobotLinkWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others learn when to come again, at different times; one that has come in makes room."""
+    monkeypatch.setattr(link_handlers, "MOST_PROVING", 2)
+    robots = [scene.dial(f"192.168.{number}.1") for number in range(4)]
+    for robot in robots:
+        robot.prove(robot.hello())
+    refusals = [robot.refusal() for robot in robots[2:]]
+    assert [each["reason"] for each in refusals] == [BUSY] * 2
+    least, most = BUSY_SECONDS
+    assert all(least <= each["retry_after"] <= most for each in refusals)
+    assert refusals[0]["retry_after"] != refusals[1]["retry_after"]
+    for robot in robots[:2]:
+        await robot.answered()
+    assert not scene.scene.proving
+    # One robot dialled all the time here, which is refused for that.
+    assert (await scene.dial().registers()).get("reason") != BUSY
 
 
 @pytest_twisted.ensureDeferred

@@ -14,6 +14,7 @@ from twisted.internet import reactor
 from twisted.internet.endpoints import TCP4ClientEndpoint
 from twisted.internet.protocol import Factory
 from twisted.internet.task import Clock
+from twisted.internet.testing import StringTransport
 from twisted.internet.threads import deferToThread
 
 from relay_protocol import link
@@ -172,3 +173,35 @@ async def test_small_message_overtakes_an_image_on_a_real_connection(listener: s
         relay.close()
     for early in ((SAMPLE, 2), (JSON, 1)):
         assert got[got.index(early) :].count((PART, 1)) > 100
+
+
+class OpenLink:
+    """A channel link on a transport in memory, joined."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.transport = StringTransport()
+        owner: Any = Robot()
+        channel = ChannelLink("t", lambda: int(self.clock.seconds() * 1e9), 2.0)
+        self.protocol = LinkProtocol(channel, lambda _: owner, self.clock)
+        self.protocol.makeConnection(self.transport)
+        self.says(link.Joined(channel="c", at=1))
+
+    def says(self, message: link.Message) -> None:
+        self.protocol.dataReceived(link.frame(message))
+
+    @property
+    def ended(self) -> bool:
+        return self.transport.disconnecting or self.transport.disconnected
+
+
+def test_a_process_that_was_stopped_does_not_take_the_relay_for_silent() -> None:
+    """It has not read what the relay sent meanwhile. A relay that is silent after that has lost the link."""
+    end = OpenLink()
+    end.clock.advance(30)
+    assert not end.ended
+    end.says(link.Ping(t=1))
+    end.clock.pump([0.5] * 11)
+    assert not end.ended
+    end.clock.pump([0.5] * 4)
+    assert end.ended
