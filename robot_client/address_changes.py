@@ -1,6 +1,8 @@
 """Makes the ROS participant again after the machine's addresses have changed.
 
-A participant of Fast DDS that exists when an address changes never finds nodes that start afterwards (Fast-DDS#6055).
+A participant of Fast DDS listens at the addresses of its start (Fast-DDS#6055). When all of them are gone, nodes of one
+machine that found each other before go on, but a node that starts afterwards and they never find each other. So the
+daemon stays with those that run, and follows to the new addresses when none of them is left.
 """
 
 from __future__ import annotations
@@ -11,7 +13,15 @@ from typing import Protocol
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-from robot_client.addresses import own_addresses
+from robot_client.addresses import finds_others, own_addresses
+
+_MADE_AGAIN = (
+    "until the daemon's nodes are made again; that is done when the robot stands still and has nothing to do"
+)
+_LEFT = (
+    "by those that run, nor by the daemon, since no former address is left. Start the robot's ROS nodes again; once "
+    "none of the former runs, the daemon makes its own again and finds the new ones"
+)
 
 
 class RenewableRobot(Protocol):
@@ -20,6 +30,10 @@ class RenewableRobot(Protocol):
     @property
     def is_idle(self) -> bool:
         """Whether the robot stands still, and no call or goal is under way."""
+
+    @property
+    def nodes(self) -> frozenset[str]:
+        """Full names of the ROS nodes in the graph, without the daemon's."""
 
     def release_platform(self, reason: str) -> Deferred[object]:
         """End what uses the platform; fires when the platform can be made again. The relay opens it again later."""
@@ -61,11 +75,11 @@ class AddressChanges:
             self._announced = self._latest
             self._was_idle = False
             self._log.warn(
-                "the machine's addresses have changed ({change}). ROS nodes that start now are not found until the "
-                "daemon's nodes are made again; that is done when the robot stands still and has nothing to do",
+                "the machine's addresses have changed ({change}). ROS nodes that start now are not found {until}",
                 change=self._change(),
+                until=_MADE_AGAIN if self._known & self._latest else _LEFT,
             )
-        idle = self._robot.is_idle
+        idle = self._robot.is_idle and finds_others(self._known, self._latest, self._robot.nodes)
         if idle and self._was_idle:
             self._renew()
         self._was_idle = idle

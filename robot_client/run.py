@@ -167,6 +167,11 @@ class DaemonProcess:
         """See :class:`~robot_client.address_changes.RenewableRobot`."""
         return self.daemon.is_idle
 
+    @property
+    def nodes(self) -> frozenset[str]:
+        """See :class:`~robot_client.address_changes.RenewableRobot`."""
+        return self.platform.graph().nodes
+
     def release_platform(self, reason: str) -> Deferred[Any]:
         """See :class:`~robot_client.address_changes.RenewableRobot`."""
         return self.daemon.release_platform(reason)

@@ -65,7 +65,7 @@ let in are registered soon, and the links of those that are registered stay aliv
 
 BUSY = "this relay lets many robots in at the moment"
 BUSY_SECONDS = (2.0, 10.0)
-"""Least and most seconds after which a robot that was told so comes again."""
+"""Least and most seconds after which a robot that got this refusal comes again."""
 
 FAILURES_OF_NETWORK = 1000
 """Failed proofs and enrolments allowed per network: many robots may dial from one address."""

@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
 from relay_protocol.errors import Invalid, Unavailable
-from robot_client.addresses import CHECK_SECONDS, AddressWatch, own_addresses
+from robot_client.addresses import CHECK_SECONDS, AddressWatch, own_addresses, read_interfaces_again
 from robot_client.platforms.ros2.errors import check_namespace, in_one_line
 from robot_client.platforms.ros2.executor import make_executor
 from robot_client.platforms.ros2.transport import on_this_machine, without_shared_memory
@@ -68,6 +68,7 @@ def run(name: str, namespace: str, build: Callable[[Any], S], is_busy: Callable[
     with _stop_requested() as stop:
         _run_node(name, namespace, build, is_busy, stop, lambda: click.echo("READY"))
         while not stop:
+            read_interfaces_again()
             try:
                 _run_node(name, namespace, build, is_busy, stop, _note_addresses)
             except Unavailable as error:
@@ -94,7 +95,11 @@ def _run_node(
             health = HealthReporter(node, service.finding)
             health.report()
             ready()
-            while not stop and (is_busy(service) or not addresses.changed()):
+
+            def nodes() -> list[str]:
+                return [each for each in node.get_node_names() if each != name]
+
+            while not stop and (is_busy(service) or not addresses.changed(nodes)):
                 executor.spin_once(timeout_sec=_SPIN_SECONDS)
                 health.report_if_due()
 

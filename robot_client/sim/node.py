@@ -16,6 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, LaserScan
 from std_srvs.srv import Trigger
 
+from robot_client.addresses import SIMULATOR
 from robot_client.sim import health, messages
 from robot_client.sim.camera import CAMERA_HEIGHT, SimCamera, to_jpeg, to_rgb
 from robot_client.sim.depth_camera import HEIGHT as DEPTH_HEIGHT
@@ -67,7 +68,7 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
         command_timeout: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__("switchboard_sim", namespace=namespace)
+        super().__init__(SIMULATOR, namespace=namespace)
         self._robot = robot
         self._camera = camera
         self._depth_camera = depth_camera

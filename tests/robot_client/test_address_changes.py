@@ -18,6 +18,7 @@ class Robot:
     def __init__(self) -> None:
         self.addresses = frozenset({HOME})
         self.is_idle = True
+        self.nodes: frozenset[str] = frozenset()
         self.fails = False
         self.released: Deferred[object] | None = None
         self.renewals: list[str] = []
@@ -75,6 +76,27 @@ def test_it_waits_until_the_robot_stands_still(robot: Robot) -> None:
     assert len(robot.renewals) == 1
 
 
+@pytest.mark.parametrize(
+    ("addresses", "nodes", "renewals"),
+    [
+        ((AWAY,), {"/base"}, 0),
+        ((AWAY,), {"/switchboard_sim", "/robot/gps"}, 0),
+        ((AWAY,), {"/robot/gps", "/switchboard_1a2b", "/device_switchboard_1a2b"}, 1),
+        ((HOME, VPN), {"/base"}, 1),
+    ],
+)
+def test_nodes_that_it_would_lose_are_waited_for(
+    robot: Robot, addresses: tuple[str, ...], nodes: set[str], renewals: int
+) -> None:
+    """It would if no former address is left. Services are made again too."""
+    robot.nodes = frozenset(nodes)
+    robot.has(*addresses, checks=20)
+    assert len(robot.renewals) == renewals
+    robot.nodes = frozenset()
+    robot.has(*addresses)
+    assert len(robot.renewals) == 1
+
+
 def test_nothing_is_made_again_before_the_motion_has_ended(robot: Robot) -> None:
     robot.released = Deferred()
     robot.has(AWAY, checks=20)
@@ -96,12 +118,13 @@ def test_change_is_logged_in_words(robot: Robot) -> None:
     said: list[str] = []
     globalLogPublisher.addObserver(observer := lambda event: said.append(formatEvent(event)))
     try:
-        robot.is_idle = False
+        robot.nodes = frozenset({"/base"})
         robot.has(AWAY, VPN, checks=20)
         assert [each.partition(" ROS ")[0] for each in said] == [
             f"the machine's addresses have changed (new: {VPN}, {AWAY}; gone: {HOME})."
         ]
-        robot.is_idle = True
+        assert "Start the robot's ROS nodes again" in said[0]
+        robot.nodes = frozenset()
         robot.has(AWAY, VPN)
     finally:
         globalLogPublisher.removeObserver(observer)

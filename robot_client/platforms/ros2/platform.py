@@ -20,6 +20,7 @@ from twisted.internet.defer import Deferred, fail
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
+from robot_client.addresses import read_interfaces_again
 from robot_client.alerts import OnAlert, ignore_alert
 from robot_client.motion.typed_topic import TypedTopic
 from robot_client.platforms.base import (
@@ -167,6 +168,7 @@ class Ros2Platform(Platform):
     def renew(self) -> None:
         prepared = self._calls.prepared
         self.stop()
+        read_interfaces_again()
         # DDS discovery remembers a dead node for a while; a node of the same name would be mistaken for it.
         self._renewals += 1
         self._name = f"{self._own[0].removeprefix('/')}_{self._renewals}"

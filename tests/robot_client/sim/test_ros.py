@@ -158,7 +158,8 @@ def test_robot_drives_stops_and_resets(robot: subprocess.Popen[str], graph: Grap
     drive(0.0, 0.0, lambda: odom().twist.twist.linear.x == 0.0)
     answer = graph.call(Trigger, "/reset", Trigger.Request())
     assert answer.success and answer.message
-    assert odom().pose.pose.position == begin.pose.pose.position
+    # What was published before waits in the queue.
+    graph.wait_for(lambda: odom().pose.pose.position == begin.pose.pose.position)
 
 
 def test_max_speed_takes_effect_at_once_and_is_bounded(robot: subprocess.Popen[str], graph: Graph) -> None:
