@@ -28,7 +28,7 @@ MEASUREMENTS = {
     "soak": "a minute of load: nothing is lost",
     "video": "cameras: what viewers cost, how old a picture is, slow beside fast",
     "browser": "cameras in a browser: how old the picture on the page is",
-    "thin": "a heavy topic beside commands over a thin downlink; pictures over an uplink that becomes thin",
+    "thin": "small topics beside heavy ones over thin links; pictures over an uplink that becomes thin",
     "standstill": "from a fault to standstill",
     "control": "twenty clients race for control; how long it takes to hand over",
     "stopping": "from anybody's stop to standstill, under full load",

@@ -1,5 +1,6 @@
-"""Thin links. A downlink to a client is measured in :mod:`bench.downlink`. Here an uplink becomes thin: how old
-pictures are 5 s later, how much smaller, and how soon they are as before.
+"""Thin links. A downlink to a client is measured in :mod:`bench.downlink`, small topics on an uplink in
+:mod:`bench.uplink`. Here an uplink becomes thin: how old pictures are 5 s later, how much smaller, and how soon they
+are as before.
 
 Real relay, daemon and simulated robot, whose bytes go through a proxy that hands on so many a second and holds back
 what comes beyond that. A picture is as old as the stamp in its header says, by the clock both ends share here.
@@ -10,7 +11,7 @@ from __future__ import annotations
 import statistics
 import time
 
-from bench import downlink
+from bench import downlink, uplink
 from bench.cameras import CAMERAS, Camera, Scene, scene
 from bench.report import Options, Row
 from tests.worlds.video_clients import Shown, VideoViewer
@@ -29,8 +30,8 @@ BACK_SECONDS = 120.0
 
 
 def run(options: Options) -> list[Row]:
-    """Downlinks, then both cameras, each over both uplinks."""
-    rows = downlink.run(options)
+    """Downlinks, an uplink, then both cameras, each over both uplinks."""
+    rows = downlink.run(options) + uplink.run(options)
     for camera in CAMERAS[:1] if options.quick else CAMERAS:
         with scene(camera) as at:
             for kilobits in KILOBITS[:1] if options.quick else KILOBITS:
