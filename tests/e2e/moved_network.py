@@ -15,7 +15,7 @@ from tests.worlds import robot_process
 from tests.worlds.processes import Process
 from tests.worlds.relay_process import Relay
 from tests.worlds.sync_client import Client
-from tests.worlds.waiting import wait_for
+from tests.worlds.waiting import PATIENCE, wait_for
 
 NODE = """
 import rclpy
@@ -70,10 +70,14 @@ def main(folder: Path) -> None:
             client.until(op="publish", topic="/odom")
             print("THE FORMER NODES WORK", flush=True)
             robot.sim.stop()
-            wait_for("the daemon follows", lambda: "were made again" in robot.daemon.log.read_text())
+            # A node whose farewell is lost is taken for alive for 20 s and more.
+            made_again = "the daemon's ROS nodes were made again"
+            wait_for(made_again, lambda: made_again in robot.daemon.log.read_text(), 3 * PATIENCE)
         with relay.connect("rover", relay.token("ann")) as client:
             wait_for("the new node is found", lambda: "/late" in topics(client))
         print("THE NEW NODE IS FOUND", flush=True)
+    except AssertionError as error:
+        raise AssertionError(f"{error}\n{robot.daemon.explanation()}") from None
     finally:
         if late is not None:
             late.stop()

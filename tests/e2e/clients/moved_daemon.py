@@ -1,4 +1,4 @@
-"""``switchboard-robot`` on a machine whose only address is that in a file: FILE, then its own arguments."""
+"""``switchboard-robot`` on a machine that has the addresses in a file: FILE, then its own arguments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ def main() -> None:
     file = Path(sys.argv.pop(1))
 
     def addresses() -> dict[str, list[SimpleNamespace]]:
-        return {"wlan0": [SimpleNamespace(family=socket.AF_INET, address=file.read_text())]}
+        found = file.read_text().split()
+        return {"wlan0": [SimpleNamespace(family=socket.AF_INET, address=each) for each in found]}
 
     psutil.net_if_addrs = addresses
     # The tests' own domain is limited to this machine, where no address matters.
