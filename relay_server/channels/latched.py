@@ -83,6 +83,12 @@ class LatchedSamples:
         self._samples: dict[int, Sample] = {}
         self._bytes = 0
         self._joiners: dict[ChannelMember, _Joiner] = {}
+        self._fresh_until = 0.0
+        """Samples that come until then are counted as those that publishers keep."""
+        self._fresh: set[int] = set()
+        """Their stamps."""
+        self._kept_before = 0
+        """How many there were before the robot subscribed again."""
         self._confirmed: set[int] = set()
         """Stamps that the robot has reported as kept, since the last time no request was open."""
         self._open_requests = 0
@@ -101,6 +107,12 @@ class LatchedSamples:
     def size(self) -> int:
         """Bytes of the stored samples."""
         return self._bytes
+
+    @property
+    def kept(self) -> int:
+        """About how many samples the publishers keep: as many as came when the robot had just subscribed."""
+        fresh = len(self._fresh)
+        return max(fresh, self._kept_before) if self._clock.seconds() < self._fresh_until else fresh
 
     def waits_for_replay(self, member: ChannelMember) -> bool:
         """Whether a member does not receive live samples yet."""
@@ -124,12 +136,19 @@ class LatchedSamples:
         self.newest = max(self.newest, stamp)
         self._earliest = max(self._earliest, stamp)
 
+    def begin_count(self) -> None:
+        """Count the samples that publishers keep, as the robot is about to send them."""
+        self._kept_before = self.kept
+        self._fresh.clear()
+        self._fresh_until = self._clock.seconds() + REPLAY_SECONDS
+
     def forget(self) -> None:
         """Drop all samples, as they are no longer those of the topic."""
         self.lost()
         self._samples.clear()
         self._bytes = self.newest = self._earliest = 0
         self._came.clear()
+        self._fresh.clear()
 
     def lost(self) -> None:
         """Handle the loss of the link. Samples stay: a robot with the same memory continues with its stamps."""
@@ -183,6 +202,7 @@ class LatchedSamples:
         self._open_requests += 1
         self._newest_at_request = self.newest
         self._requested_at = self._clock.seconds()
+        self.begin_count()
 
     def _send_due_request(self) -> None:
         self._timer = None
@@ -212,8 +232,11 @@ class LatchedSamples:
         """
         if not self.memory:
             self.newest += 1
+            self._count(self.newest)
             self._store(self.newest, sample)
             return True
+        if frame_stamp:
+            self._count(frame_stamp)
         if frame_stamp > self.newest:
             self.newest = frame_stamp
             self._note(frame_stamp)
@@ -248,6 +271,10 @@ class LatchedSamples:
                 joiner.received.add(stamp)
             else:
                 joiner.replay(stamp, sample)
+
+    def _count(self, stamp: int) -> None:
+        if self._clock.seconds() < self._fresh_until and len(self._fresh) < MAX_SAMPLES:
+            self._fresh.add(stamp)
 
     def _note(self, stamp: int) -> None:
         self._came.add(stamp)

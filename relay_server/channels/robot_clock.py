@@ -32,6 +32,12 @@ _NO_USER = -1
 _CDR = {b"\x00\x01": "<iI", b"\x00\x00": ">iI"}
 
 
+FORWARD_SECONDS = 10.0
+MOST_SPEED = 100.0
+"""Simulated time jumps forward if it is :data:`FORWARD_SECONDS` ahead of a simulation that is so many times as fast as
+real time."""
+
+
 class RobotClock:
     """Subscribes to a robot's ``/clock`` while its time is simulated, as one more subscriber of its channel.
 
@@ -60,8 +66,11 @@ class RobotClock:
         self._following = False
         self.jumps = 0
         """How often the simulated time has jumped back."""
-        self.on_jump: list[Callable[[], None]] = []
-        """Called when the simulated time has jumped back, before any sample with the new time is delivered."""
+        self.on_jump: list[Callable[[float], None]] = []
+        """Called with the seconds by which the simulated time has jumped, negative if back, before any sample with the
+        new time is delivered."""
+        self._known_at: float | None = None
+        """When the latest time came; ``None``: time is unknown."""
 
     def now_ns(self) -> int:
         """The robot's time, nanoseconds: since 1970, or since the simulation began."""
@@ -89,6 +98,7 @@ class RobotClock:
     def lost(self) -> None:
         """The link is lost; the time is unknown until the next message."""
         self._newest = 0
+        self._known_at = None
 
     def warn_of_drops(self, text: str, id: rosbridge.Id = None) -> None:
         """Log it."""
@@ -109,13 +119,18 @@ class RobotClock:
     def deliver(self, subscription: ClientSubscription, sample: Sample) -> None:
         """Store the time of a sample."""
         time = nanoseconds(sample.body)
-        if time is not None:
-            jumped = time < self._latest_known
-            self._newest = self._latest_known = time
-            if jumped:
-                self.jumps += 1
-                for notify in list(self.on_jump):
-                    notify()
+        if time is None:
+            return
+        step = (time - self._latest_known) / 1e9
+        now, before = self._clock.seconds(), self._known_at
+        self._newest = self._latest_known = time
+        self._known_at = now
+        if step < 0:
+            self.jumps += 1
+        elif before is None or step < FORWARD_SECONDS + MOST_SPEED * (now - before):
+            return
+        for notify in list(self.on_jump):
+            notify(step)
 
 
 class _ClockSubscription(ClientSubscription):

@@ -176,6 +176,8 @@ class RobotSubscription:
         early, self._joined_while_offline = self._joined_while_offline, set()
         if latched:
             self.latched_samples.robot_subscribed(memory, publishers)
+        if begins:
+            self.latched_samples.begin_count()
         if begins and memory:
             self.latched_samples.begin(self._latest_frame_stamp)
             self._begin_latched(early)

@@ -16,6 +16,7 @@ from relay_server.channels.members import ChannelMember
 from relay_server.channels.robot_requests import RequestPhase, RobotRequest
 from relay_server.channels.robot_subscription import RobotSubscription, unmatched_publishers_text
 from relay_server.common.clock import Timer, cancel
+from relay_server.common.send_queue import NOT_LASTING, Lasting
 
 RETRY_SECONDS = 0.25
 LONGEST_RETRY_SECONDS = 30.0
@@ -158,16 +159,17 @@ class Subscriptions:
         subscription = self._topics.get(topic)
         return subscription is not None and subscription.latched
 
-    def lasting(self, topic: str) -> int:
-        """How many of the newest samples of a topic are not replaced by newer ones: one for each of several publishers
-        that keep their last messages; otherwise 0.
+    def lasting(self, topic: str) -> Lasting:
+        """The samples of a latched topic that newer ones do not replace, as its publishers keep several.
 
-        Which publisher sent a message is not known (:mod:`relay_server.channels.latched`).
+        Which publisher sent a message is not known (:mod:`relay_server.channels.latched`). These are one for each of
+        several publishers, and as many as came when the robot had just subscribed.
         """
         subscription = self._topics.get(topic)
-        if subscription is None or not subscription.latched or subscription.publishers < 2:
-            return 0
-        return min(subscription.publishers, MAX_SAMPLES)
+        if subscription is None or not subscription.latched:
+            return NOT_LASTING
+        several = max(subscription.publishers, subscription.latched_samples.kept)
+        return Lasting(min(several, MAX_SAMPLES), subscription.publishers > 1) if several > 1 else NOT_LASTING
 
     def type_for(self, member: ChannelMember, topic: str) -> str:
         """The type that clients name for a topic that the robot does not have; empty: none."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Hashable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from relay_protocol.limits import MIB, ROBOT_FRAME
 
@@ -57,12 +57,26 @@ class LazyMessage(Protocol):
     size: int
 
 
+class Lasting(NamedTuple):
+    """Samples of a topic that newer ones do not replace.
+
+    :param newest: how many of the newest
+    :param all_ages: whether the age of none counts, as it is not known which are of another publisher
+    """
+
+    newest: int
+    all_ages: bool = False
+
+
+NOT_LASTING = Lasting(0)
+
+
 class _TopicQueue:
     """Samples of one topic that wait: time of arrival, size, sample, and number of its publisher's connection.
 
     :ivar commands: whether they are commands
     :ivar counted: whether their bytes count for the limits
-    :ivar lasting: how many of the newest are not replaced by newer ones; then none becomes stale either
+    :ivar lasting: those that are not replaced by newer ones
     """
 
     __slots__ = ("bytes", "commands", "counted", "key", "lasting", "samples")
@@ -71,14 +85,14 @@ class _TopicQueue:
         self.key = key
         self.commands = commands
         self.counted = True
-        self.lasting = 0
+        self.lasting = NOT_LASTING
         self.samples: deque[tuple[float, int, bytes | LazyMessage, int]] = deque()
         self.bytes = 0
 
     @property
     def all_last(self) -> bool:
         """Whether none of its samples is replaced by a newer one."""
-        return len(self.samples) <= self.lasting
+        return len(self.samples) <= self.lasting.newest
 
 
 class SendQueue:
@@ -324,7 +338,7 @@ class SendQueue:
         depth: int = DATA_PER_TOPIC,
         *,
         commands: bool = False,
-        lasting: int = 0,
+        lasting: Lasting = NOT_LASTING,
         source: int = 0,
     ) -> None:
         """Send a sample of a topic, or queue it; the oldest are dropped beyond the limits.
@@ -332,8 +346,8 @@ class SendQueue:
         :param key: the topic; a :class:`LazyMessage` is rendered with it
         :param depth: most samples of this topic that wait, at least one
         :param commands: whether samples of this topic are commands, which are all bytes
-        :param lasting: how many of the newest samples of this topic are not replaced by newer ones, as each may be of
-            another publisher; then age drops none, and those of other topics are dropped first
+        :param lasting: samples of this topic that are not replaced by newer ones; those of other topics are dropped
+            first
         :param source: number of the connection of the client that has published it, for :attr:`on_drop`
         """
         if not self._must_wait(key, message):
@@ -343,7 +357,7 @@ class SendQueue:
             queue = self._data[key] = _TopicQueue(key, commands)
         queue.lasting = lasting
         self._enqueue(queue, message, source)
-        while len(queue.samples) > max(depth, lasting, 1):
+        while len(queue.samples) > max(depth, lasting.newest, 1):
             self._drop_oldest(queue)
         if self._data_bytes > DATA_BYTES:
             self._evict()
@@ -438,22 +452,25 @@ class SendQueue:
         last.
         """
         while self._data_bytes - self._lasting_bytes() > DATA_BYTES:
-            several = [queue for queue in self._data.values() if len(queue.samples) > max(1, queue.lasting)]
+            several = [
+                queue for queue in self._data.values() if len(queue.samples) > max(1, queue.lasting.newest)
+            ]
             if not several:
                 return
-            fullest = max(several, key=lambda queue: (not queue.lasting, queue.bytes))
+            fullest = max(several, key=lambda queue: (not queue.lasting.newest, queue.bytes))
             # Drop a quarter at once, so that not every further sample costs a search.
-            more = len(fullest.samples) - max(1, fullest.lasting)
+            more = len(fullest.samples) - max(1, fullest.lasting.newest)
             for _ in range(min(more, max(1, len(fullest.samples) // 4))):
                 self._drop_oldest(fullest)
 
     def _forget_stale(self, queue: _TopicQueue) -> None:
-        if queue.lasting:
+        newest, all_ages = queue.lasting
+        if all_ages:
             return
         now = self._seconds()
         if self._large is not None:
-            self._drop_older(queue, now - SLOW_AGE, BURST)
-        self._drop_older(queue, now - DATA_AGE, 1)
+            self._drop_older(queue, now - SLOW_AGE, max(BURST, newest))
+        self._drop_older(queue, now - DATA_AGE, max(1, newest))
 
     def _drop_older(self, queue: _TopicQueue, oldest: float, keep: int) -> None:
         while len(queue.samples) > keep and queue.samples[0][0] < oldest:

@@ -258,12 +258,14 @@ class FoxglovePort(WebsocketPort):
             self._time_ns = now_ns
             self.send_queue.send_undroppable(TIME_KEY, messages.time(now_ns))
 
-    def _time_jumped(self) -> None:
-        """The simulated time has jumped back: begin a session at once, before samples with the new time come.
+    def _time_jumped(self, seconds: float) -> None:
+        """The simulated time has jumped; if back, begin a session at once, before samples with the new time come.
 
         With two publishers of ``/clock``, or a recording that is played in a loop, it jumps again and again. Then only
         the time is sent, which apps follow backwards too.
         """
+        if seconds > 0:
+            return
         now, before = self._clock.seconds(), self._jumped_at
         self._jumped_at = now
         if now - before >= CALM_SECONDS:

@@ -272,7 +272,7 @@ class InProcessPort:
     def _enqueue(self, waiting: deque[Sample], subscription: ClientSubscription, sample: Sample) -> None:
         """Queue a sample while paused, and drop older ones."""
         waiting.append(sample)
-        lasting = self.client.channel.subscriptions.lasting(subscription.topic)
+        lasting = self.client.channel.subscriptions.lasting(subscription.topic).newest
         most, size = max(DATA_PER_TOPIC, lasting) if lasting else 1, sum(each.size for each in waiting)
         while len(waiting) > 1 and (
             len(waiting) > most

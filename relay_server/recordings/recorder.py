@@ -390,13 +390,14 @@ class Recorder:
             return
         jump = self._jumps.seconds(name, stamp)
         if jump:
-            self._note_jump("the robot's clock", "back" if jump < 0 else "forward", abs(jump))
+            self._note_jump("the robot's clock", jump)
 
-    def _time_jumped(self) -> None:
-        self._note_jump("the robot's simulated time", "back")
+    def _time_jumped(self, seconds: float) -> None:
+        self._note_jump("the robot's simulated time", seconds)
 
-    def _note_jump(self, clock: str, direction: str, seconds: float = 0.0) -> None:
-        by = f" by {seconds:.0f} s" if seconds >= 1.0 else ""
+    def _note_jump(self, clock: str, seconds: float) -> None:
+        direction = "back" if seconds < 0 else "forward"
+        by = f" by {abs(seconds):.0f} s" if abs(seconds) >= 1.0 else ""
         self.notify("warning", f"{clock} jumped {direction}{by}; times before and after it do not compare")
 
     def keep(self, topic: str, sample: Sample, log_time: int) -> None:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_server.common import send_queue as module
-from relay_server.common.send_queue import SendQueue
+from relay_server.common.send_queue import Lasting, SendQueue
 
 MIB = 1024 * 1024
 
@@ -368,7 +368,7 @@ def test_lasting_samples_do_not_become_stale() -> None:
     receiver = paused()
     for n in range(6):
         receiver.outbox.send_droppable("stream", b"s%d" % n)
-        receiver.outbox.send_droppable("map", b"m%d" % n, lasting=2)
+        receiver.outbox.send_droppable("map", b"m%d" % n, lasting=Lasting(2, all_ages=True))
     receiver.now = 5.0
     receiver.outbox.set_limits(1000, 10_000.0)
     got = receiver.resume()
@@ -376,16 +376,25 @@ def test_lasting_samples_do_not_become_stale() -> None:
     assert [each for each in got if each[:1] == b"s"] == [b"s5"]
 
 
+def test_of_one_publisher_the_newest_do_not_become_stale() -> None:
+    receiver = paused()
+    for n in range(8):
+        receiver.outbox.send_droppable("map", b"m%d" % n, lasting=Lasting(5))
+    receiver.now = 5.0
+    receiver.outbox.set_limits(1000, 10_000.0)
+    assert receiver.resume() == [b"m3", b"m4", b"m5", b"m6", b"m7"]
+
+
 def test_lasting_samples_are_evicted_after_others() -> None:
     receiver = paused()
     for _ in range(3):
-        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=2)
+        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=Lasting(2, all_ages=True))
     for n in range(4):
         receiver.outbox.send_droppable("stream", bytes([n]) * (MIB // 4))
     assert [len(each) for each in receiver.resume()].count(MIB // 2) == 3
     receiver.outbox.pause()
     for _ in range(20):
-        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=2)
+        receiver.outbox.send_droppable("map", bytes(MIB // 2), lasting=Lasting(2, all_ages=True))
     assert receiver.outbox.waiting_bytes <= 2 * MIB
 
 
@@ -394,7 +403,7 @@ def test_a_sample_of_each_publisher_of_a_latched_topic_arrives() -> None:
     receiver = paused()
     receiver.outbox.send_droppable("stream", b"s")
     for n in range(12):
-        receiver.outbox.send_droppable("map", bytes([n]) * 500_000, 1, lasting=10)
+        receiver.outbox.send_droppable("map", bytes([n]) * 500_000, 1, lasting=Lasting(10, all_ages=True))
     for n in range(5):
         receiver.outbox.send_droppable("stream", bytes([n]) * (MIB // 2))
     got = receiver.resume()
@@ -402,5 +411,5 @@ def test_a_sample_of_each_publisher_of_a_latched_topic_arrives() -> None:
     assert [each[0] for each in got if len(each) == MIB // 2] == [1, 2, 3, 4]
     receiver.outbox.pause()
     for n in range(20):
-        receiver.outbox.send_droppable("map", bytes([n]) * MIB, lasting=20)
+        receiver.outbox.send_droppable("map", bytes([n]) * MIB, lasting=Lasting(20, all_ages=True))
     assert [each[0] for each in receiver.resume()] == list(range(4, 20))

@@ -258,10 +258,14 @@ def test_a_definition_that_has_changed_withdraws_the_channel_when_the_robot_is_b
     assert TEXTS[STRING] in schemas
 
 
-@pytest.mark.parametrize(("publishers", "arrive"), [(3, ["one", "two", "three"]), (1, ["three"])])
-def test_latched_samples_of_several_publishers_all_arrive_late(
-    world: FoxgloveWorld, publishers: int, arrive: list[str]
+@pytest.mark.parametrize(
+    ("publishers", "between", "arrive"),
+    [(3, 0.3, ["one", "two", "three"]), (1, 0.0, ["one", "two", "three"]), (1, 0.6, ["three"])],
+)
+def test_latched_samples_that_are_kept_all_arrive_late(
+    world: FoxgloveWorld, publishers: int, between: float, arrive: list[str]
 ) -> None:
+    """Those of several publishers, and those of one that come when the robot has just subscribed."""
     client = world.client()
     world.settle(client)
     channel = client.channels()["/chatter"]
@@ -272,7 +276,8 @@ def test_latched_samples_of_several_publishers_all_arrive_late(
     queue.pause()
     for stamp, each in enumerate(("one", "two", "three"), 1):
         world.channel.sample(number, text(each), stamp)
-    world.clock.advance(3)
+        world.clock.advance(between)
+    world.clock.advance(3 - 3 * between)
     queue.resume()
     assert [each.body for each in client.samples()] == [text(each) for each in arrive]
 

@@ -487,8 +487,8 @@ def test_a_clock_that_jumps_is_seen_by_a_camera_alone(world: World) -> None:
     ]
 
 
-def test_simulated_time_that_jumps_back_is_a_problem(world: World) -> None:
-    """A jump after the end changes nothing."""
+def test_simulated_time_that_jumps_is_a_problem(world: World) -> None:
+    """Back or forward. A simulation that is fast does not jump, and a jump after the end changes nothing."""
     listeners = world.channel.robot_clock.on_jump
     world.robot_comes()
     world.registry.described(world.robot, msgspec.structs.replace(world.robot.description, sim_time=True))
@@ -503,10 +503,14 @@ def test_simulated_time_that_jumps_back_is_a_problem(world: World) -> None:
     def tick(seconds: int) -> None:
         world.channel.sample(asked.number, b"\0\1\0\0" + struct.pack("<iI", seconds, 0), 0)
 
-    for seconds in (50, 51, 3):
+    for seconds in (50, 51, 3, 8, 13, 600, 601):
         tick(seconds)
-    problem = "the robot's simulated time jumped back; times before and after it do not compare"
-    assert scene.entry.problems == [problem]
+        world.clock.advance(0.1)
+    words = "times before and after it do not compare"
+    assert scene.entry.problems == [
+        f"the robot's simulated time jumped back by 48 s; {words}",
+        f"the robot's simulated time jumped forward by 587 s; {words}",
+    ]
     assert len(listeners) == 1
     scene.recorder.stop("enough")
     assert listeners == []

@@ -17,6 +17,7 @@ from relay_server.common import close_codes
 from relay_server.sessions import service_calls, session, websocket_port
 from relay_server.sessions import subscriptions as listening
 from tests.worlds.relay import STRING, TEXTS, TWIST, Person, World, text
+from tests.worlds.robot_channel_link import RobotLink
 
 
 def reported(person: Person, level: str = "error") -> list[str]:
@@ -316,6 +317,49 @@ def test_a_client_gets_a_latched_sample_of_each_publisher(world: World) -> None:
     person.rosbridge.resume()
     assert [message["msg"]["data"][0] for message in person.received("publish")] == list("0123456789")
     assert person.rosbridge.send_queue.dropped == 0
+
+
+def test_a_client_gets_all_latched_samples_of_one_publisher(world: World) -> None:
+    """A publisher may keep ten of them. A client that comes first, or later, gets them however slowly it reads."""
+    robot = RobotLink(world)
+    first, late = world.person(), world.person()
+    robot.joins()
+    first.says("subscribe", topic="/chatter", queue_length=1)
+    number = robot.subscribed("/chatter", latched=True, publishers=1, replays="memory")
+    first.rosbridge.pause()
+    for each in range(10):
+        robot.sample(number, text(str(each) * 500_000), each + 1)
+    world.clock.advance(2)
+    first.rosbridge.resume()
+    assert [message["msg"]["data"][0] for message in first.received("publish")] == list("0123456789")
+    late.says("subscribe", topic="/chatter", queue_length=1)
+    late.rosbridge.pause()
+    robot.subscribed("/chatter", latched=True, publishers=1, replays="memory")
+    for each in range(10):
+        robot.sample(number, b"", each + 1)
+    robot.sample(number, b"", 0)
+    world.clock.advance(2)
+    late.rosbridge.resume()
+    assert [message["msg"]["data"][0] for message in late.received("publish")] == list("0123456789")
+
+
+def test_of_a_latched_topic_that_goes_on_a_slow_client_gets_what_is_new(world: World) -> None:
+    """Its publisher keeps one sample, so that those before are of no use."""
+    robot = RobotLink(world)
+    person = world.person()
+    robot.joins()
+    person.says("subscribe", topic="/chatter")
+    number = robot.subscribed("/chatter", latched=True, publishers=1, replays="memory")
+    robot.sample(number, text("0"), 1)
+    world.clock.advance(1)
+    person.rosbridge.pause()
+    for each in range(1, 20):
+        robot.sample(number, text(f"{each}"), each + 1)
+        world.clock.advance(0.1)
+    person.rosbridge.resume()
+    got = [message["msg"]["data"] for message in person.received("publish")]
+    assert (got[0], got[-1]) == ("0", "19")
+    assert len(got) < 12
 
 
 def test_queued_samples_of_an_unsubscribed_topic_are_dropped(world: World) -> None:

@@ -1,6 +1,6 @@
-import { describe, expect, it } from 'vitest'
-import { ordersFor, sorted, STATES } from './modules'
-import type { ModuleStatus, ProcessStatus } from './types'
+import { afterEach, beforeEach, describe, expect, it, vi } from 'vitest'
+import { followLog, followModules, followProcesses, ordersFor, sorted, STATES } from './modules'
+import type { LogPage, ModuleList, ModuleStatus, ProcessList, ProcessStatus } from './types'
 
 const row = (pid: number, part: string, cpu: number | null): ProcessStatus => ({
   pid,
@@ -64,5 +64,73 @@ describe('ordersFor', () => {
     const pending = (action: string) => ({ pending: { action, by: 'ann', at: 0 } })
     expect(ordersFor(module('running', pending('stop')))).toEqual(['start'])
     expect(ordersFor(module('failed', pending('start')))).toEqual(['stop'])
+  })
+})
+
+describe('what is followed', () => {
+  const leave = new AbortController()
+  const asked: string[] = []
+  const accepted = new Set<string | undefined>()
+  let answers: object[] = []
+
+  /** The relay: an answer after another, the last one again and again. */
+  function relay(address: string, options: { headers: Record<string, string> }): Promise<Response> {
+    asked.push(address.replace('/api/v1/robots/rover', ''))
+    accepted.add(options.headers['Accept'])
+    return Promise.resolve(Response.json(answers.length > 1 ? answers.shift() : answers[0]))
+  }
+
+  beforeEach(() => {
+    vi.useFakeTimers()
+    vi.stubGlobal('fetch', relay)
+    asked.length = 0
+    accepted.clear()
+  })
+
+  afterEach(() => {
+    vi.useRealTimers()
+    vi.unstubAllGlobals()
+  })
+
+  it('is asked for by requests that end, until the page is left', async () => {
+    answers = [{ modules: [{ name: 'base' }] }]
+    const taken: ModuleList[] = []
+    const following = followModules('rover', (list) => taken.push(list), leave.signal).catch((error: unknown) => error)
+    await vi.advanceTimersByTimeAsync(3500)
+    expect(taken).toHaveLength(4)
+    expect([...accepted]).toEqual(['application/json'])
+    leave.abort(new Error('left'))
+    expect(await following).toEqual(new Error('left'))
+    await vi.advanceTimersByTimeAsync(5000)
+    expect(asked).toHaveLength(4)
+  })
+
+  it('is asked for less often by a user who may manage no module', async () => {
+    answers = [{ modules: [] }]
+    void followModules('rover', () => {}, new AbortController().signal)
+    await vi.advanceTimersByTimeAsync(9000)
+    expect(asked).toHaveLength(2)
+  })
+
+  it('has each line of a log once, and goes on at once behind a page that is not the last', async () => {
+    const page = (next: number, ...lines: string[]) => ({ lines: lines.map((text) => ({ text })), previous: 0, next, missed: false })
+    answers = [page(20, 'a'), page(30), page(40, 'b'), page(40)]
+    const lines: string[] = []
+    const take = (found: LogPage) => lines.push(...found.lines.map(({ text }) => text))
+    void followLog('rover', 'base', 'debug', 10, take, new AbortController().signal)
+    await vi.advanceTimersByTimeAsync(500)
+    expect(lines).toEqual(['a', 'b'])
+    expect(asked.map((address) => address.replace(/.*after=/, ''))).toEqual(['10', '20', '30', '40'])
+  })
+
+  it('has the shares of a CPU between two measurements', async () => {
+    const first = { ...row(1, 'daemon', null), busy: 10, read_at: 100 }
+    const later = { ...first, busy: 10.25, read_at: 100.5 }
+    const other = { ...later, created: 7 }
+    answers = [{ processes: [first] }, { processes: [later] }, { processes: [other] }]
+    const shares: (number | null | undefined)[] = []
+    void followProcesses('rover', 0.5, (list: ProcessList) => shares.push(list.processes[0]?.cpu), new AbortController().signal)
+    await vi.advanceTimersByTimeAsync(1200)
+    expect(shares).toEqual([null, 50, null])
   })
 })

@@ -1,7 +1,7 @@
 /** Modules and processes of a robot, without user interface. */
 import type { Level } from '../logPages'
-import { readEvents } from './events'
-import { ask, send } from './request'
+import { pauseFor } from './pause'
+import { ask } from './request'
 import type { LogPage, ModuleList, ModuleStatus, ProcessStatus, ProcessList } from './types'
 
 export type ModuleAction = 'start' | 'stop' | 'restart'
@@ -61,49 +61,88 @@ export async function orderModule(robot: string, module: string, action: ModuleA
   return done.pending ? (done.why ?? '') : ''
 }
 
-const STREAM = { headers: { Accept: 'text/event-stream' } }
+/** Milliseconds between two requests for the list of modules, and where the user may manage none. */
+const MODULES_MS = 1000
+const NO_MODULES_MS = 5000
+/** Milliseconds between two requests for new lines of a log. */
+const LOG_MS = 1000
 
-/** Passes on the modules, now and after every change, until the signal or the stream ends. */
-export async function followModules(robot: string, take: (list: ModuleList) => void, signal: AbortSignal): Promise<void> {
-  const answer = await send('get', '/api/v1/robots/{robot}/modules', { names: { robot }, ...STREAM, signal })
-  await readEvents(answer, (name, data) => name === 'modules' && take(data as ModuleList))
+/** Passes on the modules again and again, until the signal ends.
+ *
+ * Requests end. An event stream would hold one of the six connections of HTTP/1.1 that a browser opens to a host.
+ */
+export async function followModules(robot: string, take: (list: ModuleList) => void, signal: AbortSignal): Promise<never> {
+  for (;;) {
+    const list = (await ask('get', '/api/v1/robots/{robot}/modules', { names: { robot }, signal })) as ModuleList
+    take(list)
+    await pauseFor(list.modules.length > 0 ? MODULES_MS : NO_MODULES_MS, signal)
+  }
 }
 
 /** Lines of a log.
  *
- * @param before `previous` of a later page; undefined for the newest lines
+ * @param where `before`: `previous` of a later page; `after`: `next` of an earlier one; without: the newest lines
  */
-export async function readLog(robot: string, module: string, level: Level, before?: number, signal?: AbortSignal): Promise<LogPage> {
-  const options = { names: { robot, module }, query: { level, before }, signal }
+export async function readLog(
+  robot: string,
+  module: string,
+  level: Level,
+  where: { before?: number; after?: number } = {},
+  signal?: AbortSignal,
+): Promise<LogPage> {
+  const options = { names: { robot, module }, query: { level, ...where }, signal }
   return ask('get', '/api/v1/robots/{robot}/modules/{module}/log', options)
 }
 
-/** Passes on lines of a log as they are written.
+/** Passes on the lines of a log that have been written since, again and again; a page may have no lines.
  *
  * @param after `next` of an earlier page
- * @param opened called when the relay has accepted
  */
 export async function followLog(
   robot: string,
   module: string,
   level: Level,
   after: number,
-  opened: () => void,
   take: (page: LogPage) => void,
   signal: AbortSignal,
-): Promise<void> {
-  const options = { names: { robot, module }, query: { level, after }, ...STREAM, signal }
-  const answer = await send('get', '/api/v1/robots/{robot}/modules/{module}/log', options)
-  opened()
-  await readEvents(answer, (name, data) => name === 'lines' && take(data as LogPage))
+): Promise<never> {
+  for (let next = after; ; ) {
+    const page = await readLog(robot, module, level, { after: next }, signal)
+    take(page)
+    // The relay looks through a part of the log at a time, so that a page without lines may not be the last one.
+    if (page.next === next) await pauseFor(LOG_MS, signal)
+    next = page.next
+  }
 }
 
-/** Passes on measurements of all processes.
+/** Passes on measurements of all processes, with their shares of a CPU since the one before.
  *
  * @param every seconds
  */
-export async function followProcesses(robot: string, every: number, take: (list: ProcessList) => void, signal: AbortSignal): Promise<void> {
-  const options = { names: { robot }, query: { every }, ...STREAM, signal }
-  const answer = await send('get', '/api/v1/robots/{robot}/processes', options)
-  await readEvents(answer, (name, data) => name === 'processes' && take(data as ProcessList))
+export async function followProcesses(robot: string, every: number, take: (list: ProcessList) => void, signal: AbortSignal): Promise<never> {
+  const shares = new ProcessShares()
+  for (;;) {
+    const began = performance.now()
+    const list = await ask('get', '/api/v1/robots/{robot}/processes', { names: { robot }, signal })
+    take({ ...list, processes: shares.measured(list.processes as ProcessStatus[]) })
+    await pauseFor(Math.max(0, 1000 * every - (performance.now() - began)), signal)
+  }
+}
+
+/** Shares of a CPU between two measurements of this page, per cent; null for a process that the one before did not have. */
+export class ProcessShares {
+  private before = new Map<string, ProcessStatus>()
+
+  measured(processes: ProcessStatus[]): ProcessStatus[] {
+    // A number of a process is used again.
+    const key = ({ pid, created }: ProcessStatus) => `${pid} ${created}`
+    const rows = processes.map((now) => ({ ...now, cpu: share(now, this.before.get(key(now))) }))
+    this.before = new Map(processes.map((each) => [key(each), each]))
+    return rows
+  }
+}
+
+function share(now: ProcessStatus, before: ProcessStatus | undefined): number | null {
+  if (before === undefined || now.read_at <= before.read_at || now.busy < before.busy) return null
+  return (100 * (now.busy - before.busy)) / (now.read_at - before.read_at)
 }

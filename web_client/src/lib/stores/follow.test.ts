@@ -16,7 +16,7 @@ class Page extends EventTarget {
   }
 }
 
-/** A stream that lasts until its signal ends. */
+/** Work that lasts until its signal ends. */
 function streams() {
   const open = new Set<AbortSignal>()
   const stream = (signal: AbortSignal) =>
@@ -30,7 +30,7 @@ function streams() {
   return { open, stream }
 }
 
-test('a hidden page holds no stream, and a page that is seen again holds one at once', async () => {
+test('a hidden page follows nothing, and a page that is seen again follows at once', async () => {
   const page = new Page()
   vi.stubGlobal('document', page)
   const { open, stream } = streams()
@@ -63,7 +63,7 @@ test('a page that is opened in the background begins when it is seen', () => {
   end()
 })
 
-test('a stream that breaks off is opened again, but not while the page is hidden', async () => {
+test('work that fails begins again, but not while the page is hidden', async () => {
   const page = new Page()
   vi.stubGlobal('document', page)
   const stream = vi.fn(() => Promise.reject(new Error('lost')))

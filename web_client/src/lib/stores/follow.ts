@@ -1,16 +1,14 @@
-/** Keeps what a page shows up to date, by a stream of the relay or by asking again and again. */
+/** Keeps what a page shows up to date by asking again and again. */
 
 const FIRST_PAUSE_MS = 1000
-const LONGEST_PAUSE_MS = 15_000
+const LONGEST_PAUSE_MS = 5000
 
-/** Runs `stream` again and again while the page is visible, until the returned function is called.
+/** Runs `work` again and again while the page is visible, until the returned function is called. A hidden page asks nothing.
  *
- * A hidden page follows nothing: each stream holds one of the few connections that a browser opens to one relay.
- *
- * @param stream ends when its signal does
- * @param failed gets the reason when a stream could not be opened or broke off
+ * @param work ends when its signal does
+ * @param failed gets the reason when it failed
  */
-export function keepFollowing(stream: (signal: AbortSignal) => Promise<void>, failed: (reason: string) => void): () => void {
+export function keepFollowing(work: (signal: AbortSignal) => Promise<void>, failed: (reason: string) => void): () => void {
   let running = new AbortController()
   let timer: ReturnType<typeof setTimeout> | undefined
   let pause = FIRST_PAUSE_MS
@@ -19,7 +17,7 @@ export function keepFollowing(stream: (signal: AbortSignal) => Promise<void>, fa
     const { signal } = (running = new AbortController())
     const began = performance.now()
     try {
-      await stream(signal)
+      await work(signal)
     } catch (error) {
       if (signal.aborted) return
       failed(error instanceof Error ? error.message : String(error))
