@@ -17,8 +17,8 @@ from twisted.internet.address import IPv4Address, IPv6Address
 from twisted.internet.defer import CancelledError, Deferred, DeferredList, TimeoutError
 from twisted.internet.endpoints import HostnameEndpoint, wrapClientTLS
 from twisted.internet.error import ConnectError, DNSLookupError
+from twisted.internet.protocol import Factory, connectionDone
 from twisted.internet.protocol import Protocol as TwistedProtocol
-from twisted.internet.protocol import connectionDone
 from twisted.internet.ssl import optionsForClientTLS
 from twisted.python.failure import Failure
 from twisted.web.client import (
@@ -31,7 +31,7 @@ from twisted.web.client import (
     ResponseFailed,
     readBody,
 )
-from twisted.web.http import NOT_FOUND, OK
+from twisted.web.http import NOT_FOUND, OK, SWITCHING
 from twisted.web.http_headers import Headers
 from twisted.web.server import Request
 
@@ -40,10 +40,12 @@ from relay_protocol.scopes import Scope
 from relay_server.access import LOOKUP_SECONDS, NOT_LOOKED_UP, Access, Principal
 from relay_server.cluster.homes import RobotHomes
 from relay_server.cluster.relays import RelayInfo, check_compatible, lost, unreachable
+from relay_server.cluster.shared_connection import UPGRADE, SharedConnection, SharedConnectionRequest
 from relay_server.common import close_codes
 from relay_server.common.clock import Clock, sleep
-from relay_server.common.concurrency import with_timeout
+from relay_server.common.concurrency import detached, with_timeout
 from relay_server.common.freshness_tokens import HEADER as FRESHNESS
+from relay_server.common.socket_writer import FlushScheduler
 from relay_server.config import ClusterSettings
 from relay_server.robots.registry import RobotRegistry
 
@@ -63,6 +65,8 @@ WATCH_SECONDS = 5.0
 """Seconds between short requests to a relay whose answer is waited for, and in which it must answer them."""
 ANYTHING = "/api/v1/cluster/alive"
 """A path that is answered without the database; any answer will do."""
+SHARED = "/api/v1/cluster/streams"
+"""A path for the requests for shared connections; what counts is the field ``Upgrade``."""
 IDLE_CONNECTIONS = 16
 """Most idle connections that are kept to another relay."""
 
@@ -175,6 +179,11 @@ class Forwarder:
         self._pool = HTTPConnectionPool(reactor)
         self._pool.maxPersistentPerHost = IDLE_CONNECTIONS
         self._agent = Agent.usingEndpointFactory(reactor, self, self._pool)
+        self._flushes = FlushScheduler(reactor)
+        self._shared: dict[str, SharedConnection] = {}
+        """Open shared connections by the id of the other relay."""
+        self._connecting: dict[str, list[Deferred[SharedConnection]]] = {}
+        """Those that wait for one, by the id of the other relay."""
 
     def leave(self, reason: str) -> None:
         """Close the websockets of all clients.
@@ -194,8 +203,71 @@ class Forwarder:
                 each.close(close_codes.UNAVAILABLE, "the robot has connected to another relay; connect again")
 
     async def close(self) -> None:
-        """Close idle connections."""
+        """Close idle connections, and the shared ones."""
+        for each in list(self._shared.values()):
+            each.transport.loseConnection()
         await self._pool.closeCachedConnections()
+
+    async def open_stream(self, relay: RelayInfo, protocol: Any) -> None:
+        """Open a stream of bytes to another relay's listener, on the connection that all of them share.
+
+        :raises Unavailable: it can't be reached, or does not accept
+        """
+        shared = self._shared.get(relay.id)
+        if shared is None:
+            shared = await self._share(relay)
+        shared.open(protocol)
+
+    def _share(self, relay: RelayInfo) -> Deferred[SharedConnection]:
+        """A new shared connection to a relay; callers that come meanwhile get the same one."""
+        waiting: Deferred[SharedConnection] = Deferred()
+        callers = self._connecting.setdefault(relay.id, [])
+        callers.append(waiting)
+        if len(callers) == 1:
+            detached(self._connect(relay)).addBoth(self._connected, relay)
+        return waiting
+
+    async def _connect(self, relay: RelayInfo) -> SharedConnection:
+        answered: Deferred[int] = Deferred()
+
+        def done(status: int) -> None:
+            if not answered.called:
+                answered.callback(status)
+
+        shared = SharedConnection(self._reactor, self._flushes)
+        fields = {
+            "Host": relay.address,
+            "Connection": "Upgrade",
+            "Upgrade": UPGRADE,
+            CLUSTER_HEADER: self._settings.secret,
+        }
+        lines = [f"GET {SHARED} HTTP/1.1", *(f"{name}: {value}" for name, value in fields.items()), "", ""]
+        request = SharedConnectionRequest(shared, "\r\n".join(lines).encode(), done)
+        endpoint = self.endpoint(relay.host, relay.port)
+        try:
+            await endpoint.connect(Factory.forProtocol(lambda: request))
+        except Exception:
+            raise unreachable(relay) from None
+        late = f"the relay that the robot is connected to did not answer in time ({relay.address})"
+        try:
+            status = await with_timeout(self._reactor, CONNECT_SECONDS, answered, late)
+        except Unavailable:
+            request.transport.abortConnection()
+            raise
+        if status != SWITCHING:
+            raise Unavailable(
+                f"the relay that the robot is connected to answered {status} to a request for a shared "
+                f"connection ({relay.address})"
+            )
+        return shared
+
+    def _connected(self, result: SharedConnection | Failure, relay: RelayInfo) -> None:
+        if isinstance(result, SharedConnection):
+            self._shared[relay.id] = result
+            result.on_lost = lambda: self._shared.pop(relay.id, None)
+        for each in self._connecting.pop(relay.id):
+            if not each.called:
+                each.callback(result)
 
     def endpoint(self, host: str, port: int) -> Any:
         """The client endpoint of another relay."""

@@ -14,9 +14,9 @@ from http import HTTPStatus
 from typing import Any, Protocol
 
 from autobahn.websocket.types import ConnectionRequest
-from twisted.internet.defer import Deferred
-from twisted.internet.protocol import Factory, connectionDone
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.protocol import Protocol as TwistedProtocol
+from twisted.internet.protocol import connectionDone
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
@@ -27,7 +27,7 @@ from relay_server.common import close_codes
 from relay_server.common.clock import Clock
 from relay_server.common.concurrency import with_timeout
 from relay_server.common.send_queue import SendQueue
-from relay_server.common.tcp import PushProducer, enable_tcp_keepalive
+from relay_server.common.tcp import PushProducer
 from relay_server.common.websocket_frames import BINARY, CLOSE, FIN, PING, PONG, TEXT, masked, parse_head
 from relay_server.sessions.ports import ClientTransport
 
@@ -139,10 +139,7 @@ class ForwardedWebSocket:
         :raises Unavailable: it can't be reached, or refuses
         """
         check_compatible(self._relay)
-        factory = Factory.forProtocol(lambda: _HomeConnection(self))
-        connecting: Deferred[Any] = self._forwarder.endpoint(self._relay.host, self._relay.port).connect(
-            factory
-        )
+        connecting = Deferred.fromCoroutine(self._forwarder.open_stream(self._relay, _HomeConnection(self)))
         connecting.addErrback(self._not_connected)
         late = f"the relay that the robot is connected to did not answer in time ({self._relay.address})"
         try:
@@ -292,7 +289,10 @@ class ForwardedWebSocket:
             self._opening.errback(kind(reason))
 
     def _not_connected(self, failure: Failure) -> None:
-        self._fail(str(unreachable(self._relay)))
+        if failure.check(SwitchboardError):
+            self._fail(str(failure.value))
+        elif not failure.check(CancelledError):
+            self._fail(str(unreachable(self._relay)))
 
 
 class ForwardedTransport(ClientTransport, Protocol):
@@ -323,6 +323,8 @@ class _HomeConnection(TwistedProtocol):
     """The connection to the home: the head of its answer, then frames. Only the last one, a close frame, is read."""
 
     transport: Any
+    whole = b""
+    """Bytes that were whole messages when the client before got them. Many clients of a topic get the same object."""
 
     def __init__(self, client: ForwardedWebSocket) -> None:
         self._accepted = False
@@ -341,7 +343,6 @@ class _HomeConnection(TwistedProtocol):
         return self._left > 0
 
     def connectionMade(self) -> None:
-        enable_tcp_keepalive(self.transport)
         self._client.connected(self)
 
     def dataReceived(self, data: bytes) -> None:
@@ -374,7 +375,12 @@ class _HomeConnection(TwistedProtocol):
 
     def _frames(self, data: bytes) -> None:
         """Pass frames on, and stop at a close frame."""
+        if data is _HomeConnection.whole and not (self._left or self._unparsed or self.inside_message):
+            self._client.frames(data)
+            return
+        came = data
         data = self._unparsed + data
+        fragments, within = False, self._left or self._unparsed
         at, size = min(self._left, len(data)), len(data)
         self._left -= at
         while at < size:
@@ -389,11 +395,14 @@ class _HomeConnection(TwistedProtocol):
                 self._closed(data[start : start + length])
                 return
             if first & 15 < CLOSE & 15:
+                fragments = fragments or not first & FIN or not first & 15
                 self.inside_message = not first & FIN
             end = start + length
             self._left = max(0, end - size)
             at = min(end, size)
         self._unparsed = data[at:]
+        if not (within or fragments or self._left or self._unparsed):
+            _HomeConnection.whole = came
         if at:
             self._client.frames(data[:at])
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from twisted.internet.tcp import Server
+from twisted.internet.tcp import Client, Server
 
 from relay_server.common.clock import Clock
 
@@ -227,6 +227,6 @@ class PassThroughWriter:
 
 def writer_for(transport: Any, flushes: FlushScheduler) -> TransportWriter:
     """The writer for a connection. It writes to the socket itself only if nothing but Twisted's TCP does."""
-    if type(transport) is Server and not transport.TLS:
+    if type(transport) in (Server, Client) and not transport.TLS:
         return DirectSocketWriter(transport, flushes)
     return PassThroughWriter(transport)

@@ -10,6 +10,7 @@ from traceback import walk_tb
 from typing import Any, cast
 
 from twisted.logger import Logger
+from twisted.protocols.policies import ProtocolWrapper
 from twisted.python.failure import Failure
 from twisted.web.http import HTTPChannel
 from twisted.web.resource import IResource, Resource
@@ -25,7 +26,9 @@ from relay_server.cluster.forwarding import (
     check_secret,
     client_address,
 )
+from relay_server.cluster.shared_connection import ACCEPTED, UPGRADE, SharedConnection
 from relay_server.common.clock import Timer, cancel
+from relay_server.common.socket_writer import FlushScheduler
 from relay_server.common.tcp import keep_little, tcp_of
 from relay_server.http import request_fields
 from relay_server.http.cross_origin import CrossOrigin
@@ -461,6 +464,9 @@ class ForwardedRequest(BoundedRequest):
         """Check the secret, then serve the request for its client."""
         try:
             check_secret(self.getHeader(CLUSTER_HEADER), self.site.secret)
+            if self.getHeader("upgrade") == UPGRADE:
+                self._share()
+                return
             self.forwarded_client = ForwardedClient.parse(self.getHeader(CLIENT_HEADER) or "")
         except SwitchboardError as error:
             self.log.warn("{error}", error=error, limited="cluster")
@@ -471,6 +477,20 @@ class ForwardedRequest(BoundedRequest):
             return
         self.requestHeaders.removeHeader(CLUSTER_HEADER)
         super().process()
+
+    def _share(self) -> None:
+        """Go on with the connection as a shared one; each of its streams is a connection of this site."""
+        transport, self.channel.transport = self.channel.transport, None
+        shared: Any = SharedConnection(self.site.reactor, self.site.flushes, self.site.buildProtocol)
+        if isinstance(transport, ProtocolWrapper):
+            transport.wrappedProtocol = shared
+        else:
+            transport.protocol = shared
+        # It was the HTTP channel's, which reads nothing while a request is served.
+        transport.unregisterProducer()
+        transport.write(ACCEPTED)
+        shared.makeConnection(transport)
+        transport.resumeProducing()
 
     def getClientAddress(self) -> Any:
         """The address of the client."""
@@ -562,6 +582,7 @@ class ClusterSite(RelaySite):
     ) -> None:
         super().__init__(root, reactor, connection_limits, False, request_limits, self._from_relay)
         self.secret = secret
+        self.flushes = FlushScheduler(reactor)
         # The relay at which the client is adds them.
         self._headers = {}
 

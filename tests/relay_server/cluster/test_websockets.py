@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from twisted.internet.defer import Deferred, succeed
+from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 from twisted.internet.testing import StringTransport
 
@@ -171,16 +171,12 @@ class Endpoints:
         self.home = StringTransport()
         self.websockets: set[Any] = set()
 
-    def endpoint(self, host: str, port: int) -> Endpoints:
-        return self
-
     def headers(self, client: ForwardedClient) -> dict[str, str]:
         return {}
 
-    def connect(self, factory: Any) -> Deferred[Any]:
-        self.protocol = factory.buildProtocol(None)
-        self.protocol.makeConnection(self.home)
-        return succeed(self.protocol)
+    async def open_stream(self, relay: RelayInfo, protocol: Any) -> None:
+        self.protocol = protocol
+        protocol.makeConnection(self.home)
 
 
 def forwarded(early: bool = False) -> tuple[Clock, Endpoints, ClientTransport, ForwardedWebSocket, list[Any]]:
@@ -327,3 +323,25 @@ def test_the_largest_message_passes_though_the_home_takes_it_in_pieces() -> None
     assert transport.transport.producerState == "producing"
     session.message(b"next")
     assert (transport.closed, len(endpoints.home.value()) > 10_000_000) == (None, True)
+
+
+def test_a_sample_that_many_clients_get_does_not_end_the_message_before() -> None:
+    """The same bytes may be whole messages for one client, and a part of one for another."""
+    sample = websocket_frames.text(b"sample")
+    clients = [forwarded() for _ in range(3)]
+    for _, endpoints, _, session, _ in clients:
+        endpoints.protocol.dataReceived(HEAD)
+        session.start()
+    (_, one, got, *_), (_, two, other, *_), (_, three, third, *_) = clients
+    one.protocol.dataReceived(sample)
+    two.protocol.dataReceived(b"\x82\x7e\x00\xff")
+    three.protocol.dataReceived(fragment(0x01))
+    for each in (one, two, three):
+        each.protocol.dataReceived(sample)
+        each.protocol.connectionLost()
+    assert (got.sent, got.closed) == (
+        2 * sample,
+        (4503, "the connection to the robot's relay is lost; connect again"),
+    )
+    assert (other.sent, other.closed) == (b"\x82\x7e\x00\xff" + sample, "dropped")
+    assert (third.sent, third.farewell) == (fragment(0x01) + sample, None)

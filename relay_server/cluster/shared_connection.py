@@ -1,0 +1,485 @@
+"""One connection between two relays, which carries the websockets of all clients of one whose robots are at the other.
+
+Each websocket is a stream of bytes with a number. What several streams get in the same reactor turn, such as a sample
+that clients of a topic share, goes over the connection once, with their numbers. Either side can pause a stream, so
+that a client that does not read holds up no other.
+
+A frame is a head, ``count`` numbers of streams (32 bits each), and ``length`` bytes for each of these streams:
+
+=======  ======  ========================================================================
+Field    Bits    Meaning
+=======  ======  ========================================================================
+kind     8       see :class:`FrameKind`
+count    16      at most :data:`MOST_NUMBERS`
+length   32      0 unless the kind is ``DATA``
+=======  ======  ========================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from struct import Struct, pack, unpack_from
+from typing import Any
+
+from twisted.internet.error import ConnectionDone
+from twisted.internet.interfaces import IConsumer, IPushProducer, ITransport
+from twisted.internet.protocol import Protocol as TwistedProtocol
+from twisted.internet.protocol import connectionDone
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+from zope.interface import implementer
+
+from relay_protocol.limits import KIB, MIB
+from relay_server.common.clock import Clock
+from relay_server.common.socket_writer import FlushScheduler, writer_for
+from relay_server.common.tcp import PushProducer, enable_tcp_keepalive, tcp_of
+
+UPGRADE = "switchboard-streams"
+"""The protocol to which the relay that connects asks to switch (RFC 9110 section 7.8)."""
+
+ACCEPTED = f"HTTP/1.1 101 Switching Protocols\r\nConnection: Upgrade\r\nUpgrade: {UPGRADE}\r\n\r\n".encode()
+
+HEAD_BYTES = 16 * KIB
+"""Most bytes of the answer to the request for the connection."""
+
+MOST_NUMBERS = 1024
+"""Most streams that one frame is for."""
+
+JOINED_BYTES = 32 * KIB
+"""Bytes that are written before the end of the reactor turn, so that it is soon known if the transport is full."""
+
+BUFFER_BYTES = 256 * KIB
+"""Bytes in the transport's buffer that pause all streams."""
+
+UNREAD_BYTES = 64 * KIB
+"""Bytes that wait for a stream that is not read, after which the other relay is asked to pause it."""
+
+MOST_UNREAD_BYTES = 64 * MIB
+"""The same, after which the stream ends: the other relay did not pause it. One message may be large."""
+
+_HEAD = Struct("!BHI")
+
+
+class FrameKind(IntEnum):
+    """What a frame says of its streams."""
+
+    OPEN = 1
+    """One begins; the relay that has connected chooses the number."""
+    DATA = 2
+    PAUSE = 3
+    """The sender takes no more bytes for now."""
+    RESUME = 4
+    END = 5
+    """The sender has closed it."""
+
+
+class _HeldFrame:
+    """A frame that is sent at the end of the reactor turn, if not before.
+
+    :param index: its place in the order of frames
+    """
+
+    __slots__ = ("data", "index", "kind", "numbers")
+
+    def __init__(self, index: int, kind: FrameKind, numbers: list[int], data: bytes) -> None:
+        self.index = index
+        self.kind = kind
+        self.numbers = numbers
+        self.data = data
+
+
+@implementer(ITransport, IConsumer, IPushProducer)
+class StreamTransport:
+    """One end of a stream: the transport of a protocol.
+
+    :ivar protocol: receives the bytes; may be replaced
+    """
+
+    TLS = False
+
+    def __init__(self, shared: SharedConnection, number: int, protocol: Any) -> None:
+        self.protocol = protocol
+        self.disconnecting = False
+        self.number = number
+        self._shared = shared
+        self._producer: Any = None
+        self._producer_paused = False
+        self._held_by_peer = False
+        self._reading = True
+        self._unread: list[bytes] = []
+        self._unread_bytes = 0
+        self._asked_to_pause = False
+        self._over = False
+        """Whether no byte can come any more."""
+
+    # --- ITransport, IConsumer ----------------------------------------------------------------------------
+
+    def write(self, data: bytes) -> None:
+        """Send bytes, at the end of the reactor turn."""
+        if data and not (self.disconnecting or self._over):
+            self._shared.send_data(self.number, data)
+
+    def writeSequence(self, data: list[bytes]) -> None:
+        """See ``ITransport``."""
+        self.write(b"".join(data))
+
+    def loseConnection(self) -> None:
+        """Close the stream behind what was written."""
+        if not self.disconnecting:
+            self.disconnecting = True
+            self._shared.close_stream(self)
+
+    abortConnection = loseConnection
+
+    def getPeer(self) -> Any:
+        """The address of the other relay."""
+        return self._shared.transport.getPeer()
+
+    def getHost(self) -> Any:
+        """The address of this relay."""
+        return self._shared.transport.getHost()
+
+    def setTcpNoDelay(self, enabled: bool) -> None:
+        """Nothing: the connection is shared."""
+
+    def setTcpKeepAlive(self, enabled: bool) -> None:
+        """Nothing: the connection is shared."""
+
+    def registerProducer(self, producer: Any, streaming: bool) -> None:
+        """See ``IConsumer``; only producers that push."""
+        self._producer = producer
+        self._producer_paused = False
+        self.update_producer()
+
+    def unregisterProducer(self) -> None:
+        """See ``IConsumer``."""
+        self._producer = None
+
+    # --- IPushProducer ------------------------------------------------------------------------------------
+
+    def pauseProducing(self) -> None:
+        """Pass no more bytes to the protocol."""
+        self._reading = False
+
+    def resumeProducing(self) -> None:
+        """Pass bytes to the protocol again, those that wait in a reactor turn of their own."""
+        if self._reading:
+            return
+        self._reading = True
+        if self._unread or self._over:
+            self._shared.clock.callLater(0, self._read_waiting)
+
+    def stopProducing(self) -> None:
+        """See ``IPushProducer``."""
+        self.loseConnection()
+
+    def _read_waiting(self) -> None:
+        if not self._reading:
+            return
+        data, self._unread, self._unread_bytes = b"".join(self._unread), [], 0
+        if self._asked_to_pause:
+            self._asked_to_pause = False
+            self._shared.send_control(FrameKind.RESUME, self.number)
+        if data:
+            self._pass_on(data)
+        if self._over and self._reading:
+            self.lost()
+
+    # --- the shared connection ----------------------------------------------------------------------------
+
+    def received(self, data: bytes) -> None:
+        """Bytes have come."""
+        if self._reading and not self._unread:
+            self._pass_on(data)
+            return
+        self._unread.append(data)
+        self._unread_bytes += len(data)
+        if self._unread_bytes > MOST_UNREAD_BYTES:
+            self.loseConnection()
+        elif self._unread_bytes > UNREAD_BYTES and not self._asked_to_pause:
+            self._asked_to_pause = True
+            self._shared.send_control(FrameKind.PAUSE, self.number)
+
+    def _pass_on(self, data: bytes) -> None:
+        if self.disconnecting:
+            return
+        try:
+            self.protocol.dataReceived(data)
+        except Exception:
+            self._shared.log.failure("bytes of a stream could not be handled; it is closed")
+            self.loseConnection()
+
+    def held(self, paused: bool) -> None:
+        """The other relay takes no bytes, or takes them again."""
+        self._held_by_peer = paused
+        self.update_producer()
+
+    def update_producer(self) -> None:
+        """Pause or resume the producer."""
+        pause = self._held_by_peer or self._shared.full
+        if self._producer is None or pause == self._producer_paused:
+            return
+        self._producer_paused = pause
+        if pause:
+            self._producer.pauseProducing()
+        else:
+            self._producer.resumeProducing()
+
+    def ended(self) -> None:
+        """The other relay has closed the stream; what waits is read first."""
+        self._over = True
+        if not self._unread:
+            self.lost()
+
+    def lost(self) -> None:
+        """The stream is over."""
+        self.disconnecting = True
+        protocol, self.protocol, self._producer = self.protocol, None, None
+        self._unread.clear()
+        if protocol is not None:
+            protocol.connectionLost(Failure(ConnectionDone()))
+
+
+class SharedConnection(TwistedProtocol):
+    """One end of the connection.
+
+    :param flushes: of the connections of this relay
+    :param accept: builds the protocol of a stream that the other relay opens; ``None``: it opens none
+    :ivar full: whether the transport takes no more bytes for now
+    :ivar on_lost: called when the connection is gone
+    """
+
+    log = Logger()
+    transport: Any
+
+    def __init__(
+        self, clock: Clock, flushes: FlushScheduler, accept: Callable[[Any], Any] | None = None
+    ) -> None:
+        self.clock = clock
+        self.full = False
+        self.on_lost: Callable[[], object] = _nothing
+        self._flushes = flushes
+        self._accept = accept
+        self._streams: dict[int, StreamTransport] = {}
+        self._opened = 0
+        self._rest = b""
+        self._numbers: tuple[int, ...] = ()
+        self._left = 0
+        """Bytes that are left of a frame for :attr:`_numbers`."""
+        self._held: list[_HeldFrame] = []
+        self._held_bytes = 0
+        self._by_data: dict[int, _HeldFrame] = {}
+        """Held frames by the identity of their data."""
+        self._latest: dict[int, int] = {}
+        """The last held frame of each stream."""
+
+    def connectionMade(self) -> None:
+        """Both relays have agreed on it."""
+        enable_tcp_keepalive(self.transport)
+        tcp = tcp_of(self.transport)
+        if tcp is not None:
+            tcp.bufferSize = BUFFER_BYTES
+        self._writer = writer_for(self.transport, self._flushes)
+        self.transport.registerProducer(PushProducer(self), True)
+
+    def connectionLost(self, reason: Failure = connectionDone) -> None:
+        """All streams are over."""
+        streams, self._streams = list(self._streams.values()), {}
+        self._held.clear()
+        self.on_lost()
+        for each in streams:
+            each.lost()
+
+    def pause(self) -> None:
+        """The transport's buffer is full."""
+        self._set_full(True)
+
+    def resume(self) -> None:
+        """The transport takes bytes again."""
+        self._set_full(False)
+
+    def _set_full(self, full: bool) -> None:
+        self.full = full
+        for each in list(self._streams.values()):
+            if self.full is not full:
+                # What the streams before wrote has changed it.
+                break
+            each.update_producer()
+
+    def open(self, protocol: Any) -> StreamTransport:
+        """Open a stream, which the protocol can use at once."""
+        self._opened += 1
+        stream = self._streams[self._opened] = StreamTransport(self, self._opened, protocol)
+        self.send_control(FrameKind.OPEN, stream.number)
+        protocol.makeConnection(stream)
+        return stream
+
+    # --- sending ------------------------------------------------------------------------------------------
+
+    def send_data(self, number: int, data: bytes) -> None:
+        """Send bytes of a stream, in one frame with others that get the same object."""
+        held = self._by_data.get(id(data))
+        latest = self._latest
+        # Not twice in one frame, whose bytes may come in parts.
+        if held is not None and latest.get(number, -1) < held.index and len(held.numbers) < MOST_NUMBERS:
+            held.numbers.append(number)
+            latest[number] = held.index
+            return
+        self._by_data[id(data)] = self._hold(FrameKind.DATA, number, data)
+        self._held_bytes += len(data)
+        if self._held_bytes >= JOINED_BYTES:
+            self._flush()
+
+    def send_control(self, kind: FrameKind, number: int) -> None:
+        """Send a frame without data, in order with the others."""
+        self._hold(kind, number, b"")
+
+    def _hold(self, kind: FrameKind, number: int, data: bytes) -> _HeldFrame:
+        if not self._held:
+            # The reactor makes due calls before it polls for events again.
+            self.clock.callLater(0, self._flush)
+        held = _HeldFrame(len(self._held), kind, [number], data)
+        self._held.append(held)
+        self._latest[number] = held.index
+        return held
+
+    def _flush(self) -> None:
+        held, self._held = self._held, []
+        self._by_data.clear()
+        self._latest.clear()
+        self._held_bytes = 0
+        parts: list[bytes] = []
+        for each in held:
+            count = len(each.numbers)
+            parts += (
+                _HEAD.pack(each.kind, count, len(each.data)),
+                pack(f"!{count}I", *each.numbers),
+                each.data,
+            )
+        if parts:
+            self._writer.write(b"".join(parts))
+            self._writer.flush()
+
+    def close_stream(self, stream: StreamTransport) -> None:
+        """End a stream of this side; its protocol learns of it in a reactor turn of its own."""
+        if self._streams.pop(stream.number, None) is not None:
+            self.send_control(FrameKind.END, stream.number)
+        self.clock.callLater(0, stream.lost)
+
+    # --- receiving ----------------------------------------------------------------------------------------
+
+    def dataReceived(self, data: bytes) -> None:
+        """Pass on the bytes of streams as they come."""
+        if self._rest:
+            data, self._rest = self._rest + data, b""
+        at, size = 0, len(data)
+        while at < size:
+            if self._left:
+                part = data[at : at + self._left] if at or self._left < size else data
+                at += len(part)
+                self._left -= len(part)
+                self._pass_on(part)
+                continue
+            start = at + _HEAD.size
+            if start > size:
+                break
+            kind, count, length = _HEAD.unpack_from(data, at)
+            if count > MOST_NUMBERS:
+                self.log.error("another relay sent a frame for {count} streams", count=count)
+                self.transport.abortConnection()
+                return
+            end = start + 4 * count
+            if end > size:
+                break
+            numbers = unpack_from(f"!{count}I", data, start)
+            at = end
+            if kind == FrameKind.DATA:
+                self._numbers, self._left = numbers, length
+            else:
+                for number in numbers:
+                    self._control(kind, number)
+        self._rest = data[at:]
+
+    def _pass_on(self, data: bytes) -> None:
+        streams = self._streams
+        for number in self._numbers:
+            stream = streams.get(number)
+            # Bytes may still come for one that this side has closed.
+            if stream is not None:
+                stream.received(data)
+
+    def _control(self, kind: int, number: int) -> None:
+        if kind == FrameKind.OPEN:
+            self._open_accepted(number)
+            return
+        stream = self._streams.get(number)
+        if stream is None:
+            return
+        if kind == FrameKind.END:
+            del self._streams[number]
+            stream.ended()
+        elif kind in (FrameKind.PAUSE, FrameKind.RESUME):
+            stream.held(kind == FrameKind.PAUSE)
+
+    def _open_accepted(self, number: int) -> None:
+        protocol = None if self._accept is None else self._accept(self.transport.getPeer())
+        if protocol is None or number in self._streams:
+            self.send_control(FrameKind.END, number)
+            return
+        stream = self._streams[number] = StreamTransport(self, number, protocol)
+        protocol.makeConnection(stream)
+
+
+class SharedConnectionRequest(TwistedProtocol):
+    """Asks another relay for a :class:`SharedConnection` over a new TCP connection.
+
+    :param head: the request (RFC 9110 section 7.8)
+    :param done: gets the answered status; after 101 the connection is in use
+    """
+
+    transport: Any
+
+    def __init__(self, shared: SharedConnection, head: bytes, done: Callable[[int], object]) -> None:
+        self._shared = shared
+        self._request = head
+        self._done = done
+        self._answer = b""
+        self._accepted = False
+
+    def connectionMade(self) -> None:
+        """Send the request."""
+        self.transport.write(self._request)
+
+    def dataReceived(self, data: bytes) -> None:
+        """The answer, and what follows it."""
+        if self._accepted:
+            self._shared.dataReceived(data)
+            return
+        self._answer += data
+        head, end, rest = self._answer.partition(b"\r\n\r\n")
+        if not end and len(self._answer) <= HEAD_BYTES:
+            return
+        words = head.split(b" ", 2)
+        status = int(words[1]) if end and len(words) > 1 and words[1].isdigit() else 502
+        if status != 101:
+            self.transport.loseConnection()
+            self._done(status)
+            return
+        self._accepted = True
+        used: Any = self._shared
+        used.makeConnection(self.transport)
+        self._done(status)
+        if rest:
+            self._shared.dataReceived(rest)
+
+    def connectionLost(self, reason: Failure = connectionDone) -> None:
+        """The connection is gone."""
+        if self._accepted:
+            self._shared.connectionLost(reason)
+        else:
+            self._done(502)
+
+
+def _nothing() -> None:
+    """Nothing waits for the end."""

@@ -1,0 +1,295 @@
+"""Streams of bytes on one connection between two relays."""
+
+from __future__ import annotations
+
+import random
+from struct import pack
+from typing import Any
+
+import pytest
+from twisted.internet.protocol import Protocol
+from twisted.internet.task import Clock
+from twisted.internet.testing import StringTransport
+
+from relay_server.cluster.shared_connection import (
+    ACCEPTED,
+    JOINED_BYTES,
+    MOST_NUMBERS,
+    MOST_UNREAD_BYTES,
+    UNREAD_BYTES,
+    SharedConnection,
+    SharedConnectionRequest,
+    StreamTransport,
+)
+from relay_server.common.socket_writer import FlushScheduler
+
+
+class Peer(Protocol):
+    """One end of a stream, which notes what comes."""
+
+    transport: Any
+
+    def __init__(self) -> None:
+        self.came = b""
+        self.lost = 0
+
+    def dataReceived(self, data: bytes) -> None:
+        self.came += data
+
+    def connectionLost(self, reason: object = None) -> None:
+        self.lost += 1
+
+
+class Flow:
+    """A producer that notes whether it may produce."""
+
+    paused = False
+
+    def pauseProducing(self) -> None:
+        self.paused = True
+
+    def resumeProducing(self) -> None:
+        self.paused = False
+
+
+class Pair:
+    """The connection of a relay that connects (``door``) and one that accepts (``home``)."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.accepted: list[Peer] = []
+        flushes = FlushScheduler(self.clock)
+        self.door = SharedConnection(self.clock, flushes)
+        self.home = SharedConnection(self.clock, flushes, self._accept)
+        self.wires = [StringTransport(), StringTransport()]
+        for end, wire in zip((self.door, self.home), self.wires, strict=True):
+            end.makeConnection(wire)
+        self.bytes_down = 0
+
+    def _accept(self, address: object) -> Peer:
+        peer = Peer()
+        self.accepted.append(peer)
+        return peer
+
+    def opened(self) -> tuple[Peer, Peer]:
+        """Both ends of a new stream."""
+        mine = Peer()
+        self.door.open(mine)
+        self.moves()
+        return mine, self.accepted[-1]
+
+    def moves(self, pieces: random.Random | None = None) -> None:
+        """Let bytes pass until nothing more is under way."""
+        while True:
+            self.clock.advance(0)
+            up, down = (wire.value() for wire in self.wires)
+            if not up and not down:
+                return
+            self.bytes_down += len(down)
+            for wire in self.wires:
+                wire.clear()
+            for data, end in ((up, self.home), (down, self.door)):
+                at = 0
+                while at < len(data):
+                    size = len(data) if pieces is None else pieces.randint(1, 4000)
+                    end.dataReceived(data[at : at + size])
+                    at += size
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_each_stream_gets_its_bytes_in_order_however_they_are_divided(seed: int) -> None:
+    """Also those that several streams share, and beside others in the same reactor turn."""
+    chance = random.Random(seed)
+    pair = Pair()
+    ends = [pair.opened() for _ in range(6)]
+    sent = {id(end): b"" for both in ends for end in both}
+    for _ in range(40):
+        shared = [chance.randbytes(chance.choice((1, 50, 5000, 40_000))) for _ in range(3)]
+        for _ in range(chance.randint(1, 12)):
+            both = chance.choice(ends)
+            side = chance.randint(0, 1)
+            data = chance.choice(shared)
+            both[side].transport.write(data)
+            sent[id(both[1 - side])] += data
+        if chance.random() < 0.5:
+            pair.moves(chance)
+    pair.moves(chance)
+    for both in ends:
+        for end in both:
+            assert end.came == sent[id(end)]
+
+
+def test_what_many_streams_get_is_sent_once() -> None:
+    pair = Pair()
+    homes = [pair.opened()[1] for _ in range(MOST_NUMBERS + 10)]
+    pair.bytes_down = 0
+    sample = bytes(10_000)
+    for home in homes:
+        home.transport.write(sample)
+    pair.moves()
+    assert pair.bytes_down < 3 * len(sample) + 4 * len(homes)
+    # The order of a stream comes before what can be shared.
+    pair.bytes_down = 0
+    first, second = homes[:2]
+    for peer, data in ((first, sample), (second, b"x"), (first, b"y"), (second, sample)):
+        peer.transport.write(data)
+    pair.moves()
+
+
+def test_streams_keep_their_own_order_beside_what_is_shared() -> None:
+    pair = Pair()
+    (one, first), (two, second) = pair.opened(), pair.opened()
+    a, b = b"a" * 3, b"b" * 3
+    for peer, data in ((first, a), (first, b), (second, b), (second, a), (first, a)):
+        peer.transport.write(data)
+    pair.moves()
+    assert (one.came, two.came) == (a + b + a, b + a)
+
+
+def test_much_is_sent_before_the_end_of_the_turn() -> None:
+    """So that it is known soon if the transport is full."""
+    pair = Pair()
+    _, home = pair.opened()
+    home.transport.write(bytes(JOINED_BYTES))
+    assert len(pair.wires[1].value()) > JOINED_BYTES
+
+
+def test_a_stream_that_is_not_read_is_paused_alone() -> None:
+    pair = Pair()
+    (slow, home), (quick, other) = pair.opened(), pair.opened()
+    flows = [Flow(), Flow()]
+    for peer, flow in zip((home, other), flows, strict=True):
+        peer.transport.registerProducer(flow, True)
+    slow.transport.pauseProducing()
+    for peer in (home, other):
+        peer.transport.write(bytes(UNREAD_BYTES + 1))
+    pair.moves()
+    assert (slow.came, len(quick.came)) == (b"", UNREAD_BYTES + 1)
+    assert [flow.paused for flow in flows] == [True, False]
+    slow.transport.resumeProducing()
+    assert slow.came == b""
+    pair.moves()
+    assert (len(slow.came), [flow.paused for flow in flows]) == (UNREAD_BYTES + 1, [False, False])
+
+
+def test_a_full_connection_pauses_all_its_streams() -> None:
+    pair = Pair()
+    homes = [pair.opened()[1] for _ in range(3)]
+    flows = [Flow() for _ in homes]
+    for peer, flow in zip(homes[:2], flows, strict=False):
+        peer.transport.registerProducer(flow, True)
+    producer = pair.wires[1].producer
+    producer.pauseProducing()
+    homes[2].transport.registerProducer(flows[2], True)
+    assert all(flow.paused for flow in flows)
+    producer.resumeProducing()
+    assert not any(flow.paused for flow in flows)
+
+
+def test_a_stream_that_is_never_paused_is_ended() -> None:
+    """The other relay does not do as it is asked to."""
+    pair = Pair()
+    door, home = pair.opened()
+    door.transport.pauseProducing()
+    for _ in range(MOST_UNREAD_BYTES // (1 << 20) + 1):
+        home.transport.write(bytes(1 << 20))
+        pair.moves()
+    assert (door.lost, home.lost) == (1, 1)
+
+
+def test_a_stream_ends_behind_its_bytes_and_others_go_on() -> None:
+    pair = Pair()
+    (door, home), (_, other) = pair.opened(), pair.opened()
+    door.transport.pauseProducing()
+    home.transport.write(b"last words")
+    home.transport.loseConnection()
+    home.transport.write(b"too late")
+    pair.moves()
+    assert (home.lost, door.came, door.lost) == (1, b"", 0)
+    door.transport.resumeProducing()
+    pair.moves()
+    assert (door.came, door.lost, other.lost) == (b"last words", 1, 0)
+    door.transport.write(b"no one is there")
+    door.transport.loseConnection()
+    pair.moves()
+    assert (door.lost, home.came) == (1, b"")
+
+
+def test_bytes_for_a_stream_that_was_closed_meanwhile_are_dropped() -> None:
+    pair = Pair()
+    door, home = pair.opened()
+    home.transport.write(b"crosses")
+    door.transport.abortConnection()
+    pair.moves()
+    assert (door.came, door.lost, home.lost) == (b"", 1, 1)
+
+
+def test_a_protocol_that_fails_ends_its_stream_alone() -> None:
+    pair = Pair()
+    (door, home), (other, second) = pair.opened(), pair.opened()
+    door.dataReceived = _fail  # type: ignore[method-assign]
+    home.transport.write(b"x")
+    second.transport.write(b"y")
+    pair.moves()
+    assert (home.lost, other.came) == (1, b"y")
+
+
+def _fail(data: bytes) -> None:
+    raise ZeroDivisionError
+
+
+def test_the_end_of_the_connection_ends_all_streams() -> None:
+    pair = Pair()
+    ends = [pair.opened() for _ in range(3)]
+    notes: list[str] = []
+    pair.door.on_lost = lambda: notes.append("lost")
+    pair.door.connectionLost()
+    assert ([door.lost for door, _ in ends], notes) == ([1, 1, 1], ["lost"])
+
+
+def test_the_relay_that_connected_opens_streams_alone() -> None:
+    pair = Pair()
+    unwanted = Peer()
+    pair.home.open(unwanted)
+    pair.moves()
+    assert (pair.door._streams, unwanted.lost) == ({}, 1)
+    pair.home.dataReceived(pack("!BHII", 2, 1, 3, 99) + b"abc")
+    pair.home.dataReceived(pack("!BHI", 2, MOST_NUMBERS + 1, 0))
+    assert pair.wires[1].disconnected
+
+
+@pytest.mark.parametrize(
+    ("answer", "status"),
+    [(ACCEPTED, 101), (b"HTTP/1.1 403 Forbidden\r\n\r\n", 403), (b"x" * 20_000, 502)],
+)
+def test_a_relay_accepts_the_connection_or_not(answer: bytes, status: int) -> None:
+    clock = Clock()
+    shared = SharedConnection(clock, FlushScheduler(clock))
+    statuses: list[int] = []
+    request = SharedConnectionRequest(shared, b"GET /\r\n\r\n", statuses.append)
+    wire = StringTransport()
+    request.makeConnection(wire)
+    assert wire.value() == b"GET /\r\n\r\n"
+    request.dataReceived(answer[:5])
+    request.dataReceived(answer[5:])
+    assert statuses == [status]
+    assert wire.disconnecting == (status != 101)
+    assert (wire.producer is not None) == (status == 101)
+    lost: list[bool] = []
+    shared.on_lost = lambda: lost.append(True)
+    request.connectionLost()
+    assert lost == ([True] if status == 101 else [])
+
+
+def test_a_stream_is_a_transport() -> None:
+    pair = Pair()
+    door, _ = pair.opened()
+    transport: StreamTransport = door.transport
+    transport.setTcpNoDelay(True)
+    transport.setTcpKeepAlive(True)
+    assert transport.getPeer() == pair.wires[0].getPeer()
+    assert transport.getHost() == pair.wires[0].getHost()
+    transport.writeSequence([b"a", b"b"])
+    transport.stopProducing()
+    pair.moves()
+    assert pair.accepted[0].came == b"ab"
