@@ -34,14 +34,14 @@ class ClusterAdmin:
     def __init__(self, cluster: Cluster | None) -> None:
         self._cluster = cluster
 
-    def drain(self) -> DrainState:
+    async def drain(self) -> DrainState:
         """Begin to drain this relay, and return how far it is.
 
         :raises NotFound: this is the only relay
-        :raises Unavailable: there is no other live relay
+        :raises Unavailable: there is no other relay that takes robots
         """
         cluster = self._member()
-        cluster.drain.begin()
+        await cluster.drain.begin()
         return cluster.drain.state
 
     async def status(self) -> ClusterState:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -40,12 +40,15 @@ class DrainState(msgspec.Struct, frozen=True):
 class Drain:
     """
     :param robots: that this relay knows
-    :param others: whether the cluster has another relay
+    :param others: whether the cluster has another relay that takes robots
+    :ivar begun: no robot is taken any more
     """
 
     log = Logger()
 
-    def __init__(self, reactor: Any, robots: Iterable[RobotState], others: Callable[[], bool]) -> None:
+    def __init__(
+        self, reactor: Any, robots: Iterable[RobotState], others: Callable[[], Awaitable[bool]]
+    ) -> None:
         self.begun = False
         self.close_clients: Sequence[Callable[[str], object]] = ()
         """Functions that together close the websockets of all clients, with a reason."""
@@ -59,18 +62,23 @@ class Drain:
         """The state now."""
         return DrainState(len(self._connected()), self._done is not None and self._done.called)
 
-    def begin(self) -> None:
+    async def begin(self) -> None:
         """Begin to drain, if that has not begun yet.
 
         :raises Unavailable: no other relay could take over
         """
         if self.begun:
             return
-        if not self._others():
-            raise Unavailable(
-                "there is no other relay that could take over the robots of this one; stop this relay instead"
-            )
+        # Before the others are asked: of two relays that are drained at the same time, neither counts on the other.
         self.begun = True
+        try:
+            if not await self._others():
+                raise Unavailable(
+                    "there is no other relay that could take over the robots of this one; stop this relay instead"
+                )
+        except BaseException:
+            self.begun = False
+            raise
         self.log.info("this relay is drained")
         self._done = Deferred.fromCoroutine(self._run())
         self._done.addErrback(lambda failure: self.log.failure("the drain failed", failure))
@@ -78,7 +86,7 @@ class Drain:
     async def run(self) -> None:
         """Drain this relay if there are others; returns when that is done."""
         with suppress(Unavailable):
-            self.begin()
+            await self.begin()
         while self.begun and not self.state.done:
             await deferLater(self._reactor, POLL_SECONDS)
 

@@ -120,10 +120,12 @@ class Cluster:
         """All other relays."""
         return [each for each in self.relays if each.id != self.id]
 
-    def _has_others(self) -> bool:
-        """Whether robots of this relay can connect to another one."""
+    async def _has_others(self) -> bool:
+        """Whether robots of this relay can connect to another one. One that does not answer may still take them."""
         group = self.settings.group
-        return any(each.compatible and not (group and each.group == group) for each in self.others())
+        found = {each.id for each in self.others() if not (group and each.group == group)}
+        state = await self.status.read()
+        return any(each.id in found and each.state in ("ready", "silent") for each in state.relays)
 
     async def start(self, site: Any, tls: Any) -> None:
         """Listen for the other relays, and join them.

@@ -14,7 +14,6 @@ from relay_db.names import full_name_of
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, SwitchboardError
 from relay_server.cluster.admin import ClusterAdmin
-from relay_server.cluster.drain import DrainState
 from relay_server.cluster.relays import RelayInfo
 from relay_server.common.concurrency import shield
 from relay_server.common.data_dir import SENT_HEADER, parse_sent
@@ -168,10 +167,7 @@ class AdminSocket:
 
     @app.route("/drain", methods=["POST"])
     def drain(self, request: Request) -> Deferred[bytes]:
-        return Deferred.fromCoroutine(self._respond(request, self._drain()))
-
-    async def _drain(self) -> DrainState:
-        return self._cluster.drain()
+        return Deferred.fromCoroutine(self._respond(request, self._cluster.drain()))
 
     @app.route("/cluster", methods=["POST"])
     def cluster(self, request: Request) -> Deferred[bytes]:

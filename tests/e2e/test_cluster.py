@@ -308,7 +308,7 @@ def test_the_command_line_at_another_relay_reaches_modules(fleet: Fleet) -> None
     assert "base is up" in fleet.second.run_cli("module", "log", "rover", "base").stdout
     assert [each["name"] for each in fleet.second.cli("top", "rover")["processes"]] == ["base"]
     refused = fleet.second.run_cli("module", "stop", "rover", "arm")
-    assert (refused.returncode, "no module 'arm'; it has base" in refused.stderr) == (1, True)
+    assert (refused.returncode, "no module 'arm'; it has base" in refused.stderr) == (3, True)
     entries = fleet.first.cli("audit", "list")
     assert [each["actor"] for each in entries if each["action"] == "module.restart"] == [f"cli:{os_user()}"]
 
@@ -630,6 +630,9 @@ def test_a_drained_relay_gives_its_robots_and_clients_to_the_others(fleet: Fleet
     assert fleet.second.cli("drain") == {"robots": 0, "done": True}
     ready = [httpx.get(f"http://127.0.0.1:{each.http_port}/readyz").status_code for each in fleet.relays]
     assert ready == [200, 503]
+    # Its robots would have nowhere to go.
+    refused = fleet.first.run_cli("drain")
+    assert (refused.returncode, "no other relay" in refused.stdout + refused.stderr) == (3, True)
     with End(fleet.second.robots_port) as robot:
         robot.send(link.Hello(version=PROTOCOL_VERSION, robot="rover", key="", encodings=["json"]))
         assert robot.until("refused")["retry_after"] == 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
+from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import NotFound, Unavailable
@@ -33,7 +33,7 @@ class Scene:
     :ivar reasons: with which all clients were closed
     """
 
-    def __init__(self, *, others: bool = True) -> None:
+    def __init__(self, *, others: bool | None = True) -> None:
         self.clock = Clock()
         self.closed: list[str] = []
         self.reasons: list[str] = []
@@ -42,8 +42,17 @@ class Scene:
         for robot in self.robots[:-1]:
             link: Any = Link(robot, self.closed)
             robot.control_link = link
-        self.drain = Drain(self.clock, self.robots, lambda: others)
+        self.others = Deferred[bool]()
+        self.drain = Drain(self.clock, self.robots, lambda: self.others)
+        if others is not None:
+            self.others.callback(others)
         self.drain.close_clients = [self.reasons.append]
+
+    def begins(self) -> list[Any]:
+        """Begins to drain; returns the result when there is one."""
+        results: list[Any] = []
+        Deferred.fromCoroutine(self.drain.begin()).addBoth(results.append)
+        return results
 
     def run(self, seconds: float) -> None:
         self.clock.pump([0.1] * round(seconds / 0.1))
@@ -52,8 +61,7 @@ class Scene:
 def test_robots_are_asked_one_after_another_then_clients_are_closed() -> None:
     """Robots without clients come first. A second order to drain changes nothing."""
     scene = Scene()
-    scene.drain.begin()
-    scene.drain.begin()
+    assert scene.begins() == scene.begins() == [None]
     assert scene.closed == ["r1"]
     assert scene.drain.state == DrainState(robots=2, done=False)
     scene.run(1)
@@ -68,7 +76,7 @@ def test_robots_are_asked_one_after_another_then_clients_are_closed() -> None:
 
 def test_robots_that_reach_no_other_relay_are_not_waited_for_for_ever() -> None:
     scene = Scene()
-    scene.drain.begin()
+    scene.begins()
     scene.run(MOVE_SECONDS - 1)
     assert scene.reasons == []
     scene.run(2)
@@ -77,8 +85,19 @@ def test_robots_that_reach_no_other_relay_are_not_waited_for_for_ever() -> None:
 
 def test_the_only_relay_is_not_drained() -> None:
     scene = Scene(others=False)
-    with pytest.raises(Unavailable, match="no other relay"):
-        scene.drain.begin()
+    (failure,) = scene.begins()
+    assert failure.check(Unavailable)
+    assert "no other relay" in failure.getErrorMessage()
     assert not scene.drain.begun
-    with pytest.raises(NotFound, match="not one of a cluster"):
-        ClusterAdmin(None).drain()
+    (alone,) = [Deferred.fromCoroutine(ClusterAdmin(None).drain())]
+    alone.addErrback(lambda failure: failure.trap(NotFound))
+    assert alone.result is NotFound
+
+
+def test_a_relay_that_asks_the_others_already_counts_as_drained() -> None:
+    """So two that are drained at the same time do not count on each other."""
+    scene = Scene(others=None)
+    results = scene.begins()
+    assert (scene.drain.begun, scene.closed, results) == (True, [], [])
+    scene.others.callback(False)
+    assert (scene.drain.begun, scene.closed) == (False, [])

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, succeed
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import NotFound, Unavailable
@@ -34,7 +34,7 @@ class Member:
     def __init__(self, clock: Clock, bus: LocalBus, own: RelayInfo) -> None:
         homes: Any = Homes()
         self.relays = RelayDirectory(clock, bus, lambda: own)
-        self.drain = Drain(clock, [], lambda: True)
+        self.drain = Drain(clock, [], lambda: succeed(True))
         meter = LoadMeter(self.drain, lambda: 3, lambda: 4, lambda: 5, lambda: float("inf"))
         self.status = ClusterStatus(bus, self.relays, homes, meter, own.id)
         Deferred.fromCoroutine(self.relays.start())
