@@ -205,7 +205,7 @@ class Forwarder:
     async def close(self) -> None:
         """Close idle connections, and the shared ones."""
         for each in list(self._shared.values()):
-            each.transport.loseConnection()
+            each.close()
         await self._pool.closeCachedConnections()
 
     async def open_stream(self, relay: RelayInfo, protocol: Any) -> None:

@@ -283,6 +283,13 @@ class SharedConnection(TwistedProtocol):
         self._writer = writer_for(self.transport, self._flushes)
         self.transport.registerProducer(PushProducer(self), True)
 
+    def close(self) -> None:
+        """Close the connection behind what was written."""
+        self._flush()
+        # TLS would not shut down while a producer is registered.
+        self.transport.unregisterProducer()
+        self.transport.loseConnection()
+
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """All streams are over."""
         streams, self._streams = list(self._streams.values()), {}
