@@ -17,7 +17,8 @@ length   32      0 unless the kind is ``DATA``
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
 from enum import IntEnum
 from struct import Struct, pack, unpack_from
 from typing import Any
@@ -58,7 +59,15 @@ UNREAD_BYTES = 64 * KIB
 MOST_UNREAD_BYTES = 64 * MIB
 """The same, after which the stream ends: the other relay did not pause it. One message may be large."""
 
+APART_SECONDS = 0.0005
+"""Small pieces this far apart are written at once, and not at the end of the turn."""
+
+AT_ONCE_BYTES = 2 * KIB
+"""Most bytes of such a piece. A larger one may be what many streams get."""
+
 _HEAD = Struct("!BHI")
+_SINGLE = Struct("!BHII")
+"""The head of a frame for one stream."""
 
 
 class FrameKind(IntEnum):
@@ -78,15 +87,23 @@ class _HeldFrame:
     """A frame that is sent at the end of the reactor turn, if not before.
 
     :param index: its place in the order of frames
+    :ivar more: what the only stream of this frame gets behind its first data
     """
 
-    __slots__ = ("data", "index", "kind", "numbers")
+    __slots__ = ("data", "index", "kind", "more", "numbers")
 
     def __init__(self, index: int, kind: FrameKind, numbers: list[int], data: bytes) -> None:
         self.index = index
         self.kind = kind
         self.numbers = numbers
         self.data = data
+        self.more: list[bytes] = []
+
+    def parts(self) -> Iterable[bytes]:
+        """The frame in parts."""
+        count, length = len(self.numbers), len(self.data) + sum(map(len, self.more))
+        head = _HEAD.pack(self.kind, count, length)
+        return (head, pack(f"!{count}I", *self.numbers), self.data, *self.more)
 
 
 @implementer(ITransport, IConsumer, IPushProducer)
@@ -269,6 +286,7 @@ class SharedConnection(TwistedProtocol):
         """Bytes that are left of a frame for :attr:`_numbers`."""
         self._held: list[_HeldFrame] = []
         self._held_bytes = 0
+        self._sent_at = -math.inf
         self._by_data: dict[int, _HeldFrame] = {}
         """Held frames by the identity of their data."""
         self._latest: dict[int, int] = {}
@@ -333,7 +351,21 @@ class SharedConnection(TwistedProtocol):
             held.numbers.append(number)
             latest[number] = held.index
             return
-        self._by_data[id(data)] = self._hold(FrameKind.DATA, number, data)
+        if not self._held:
+            now = self._flushes.seconds()
+            if now - self._sent_at >= APART_SECONDS and len(data) <= AT_ONCE_BYTES:
+                self._sent_at = now
+                self._write(_SINGLE.pack(FrameKind.DATA, 1, len(data), number) + data)
+                return
+            self._by_data[id(data)] = self._hold(FrameKind.DATA, number, data)
+        else:
+            last = self._held[-1]
+            if last.kind is FrameKind.DATA and len(last.numbers) == 1 and last.numbers[0] == number:
+                # In one piece, which the other relay reads at once. It is not shared then.
+                self._by_data.pop(id(last.data), None)
+                last.more.append(data)
+            else:
+                self._by_data[id(data)] = self._hold(FrameKind.DATA, number, data)
         self._held_bytes += len(data)
         if self._held_bytes >= JOINED_BYTES:
             self._flush()
@@ -356,17 +388,12 @@ class SharedConnection(TwistedProtocol):
         self._by_data.clear()
         self._latest.clear()
         self._held_bytes = 0
-        parts: list[bytes] = []
-        for each in held:
-            count = len(each.numbers)
-            parts += (
-                _HEAD.pack(each.kind, count, len(each.data)),
-                pack(f"!{count}I", *each.numbers),
-                each.data,
-            )
-        if parts:
-            self._writer.write(b"".join(parts))
-            self._writer.flush()
+        if held:
+            self._write(b"".join(part for each in held for part in each.parts()))
+
+    def _write(self, data: bytes) -> None:
+        self._writer.write(data)
+        self._writer.flush()
 
     def close_stream(self, stream: StreamTransport) -> None:
         """End a stream of this side; its protocol learns of it in a reactor turn of its own."""

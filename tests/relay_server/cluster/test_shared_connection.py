@@ -112,6 +112,7 @@ def test_each_stream_gets_its_bytes_in_order_however_they_are_divided(seed: int)
             both[side].transport.write(data)
             sent[id(both[1 - side])] += data
         if chance.random() < 0.5:
+            pair.clock.advance(chance.choice((0, 0, 1)))
             pair.moves(chance)
     pair.moves(chance)
     for both in ends:
@@ -144,6 +145,22 @@ def test_streams_keep_their_own_order_beside_what_is_shared() -> None:
         peer.transport.write(data)
     pair.moves()
     assert (one.came, two.came) == (a + b + a, b + a)
+
+
+def test_small_messages_are_sent_at_once_and_those_that_follow_in_one_piece() -> None:
+    pair = Pair()
+    door, home = pair.opened()
+    pair.clock.advance(1)
+    home.transport.write(b"first")
+    assert pair.wires[1].value().endswith(b"first")
+    pair.wires[1].clear()
+    for number in range(10):
+        home.transport.write(b"%d" % number)
+    assert pair.wires[1].value() == b""
+    pair.clock.advance(0)
+    assert pair.wires[1].value().endswith(b"0123456789")
+    pair.door.dataReceived(pair.wires[1].value())
+    assert door.came == b"0123456789"
 
 
 def test_much_is_sent_before_the_end_of_the_turn() -> None:
