@@ -121,11 +121,13 @@ class Cluster:
         return [each for each in self.relays if each.id != self.id]
 
     async def _has_others(self) -> bool:
-        """Whether robots of this relay can connect to another one. One that does not answer may still take them."""
+        """Whether robots of this relay can connect to another one. Without the bus none can answer."""
+        await self.relays.refresh(acquire=False)
         group = self.settings.group
         found = {each.id for each in self.others() if not (group and each.group == group)}
         state = await self.status.read()
-        return any(each.id in found and each.state in ("ready", "silent") for each in state.relays)
+        taking = ("ready",) if state.bus else ("ready", "silent")
+        return any(each.id in found and each.state in taking for each in state.relays)
 
     async def start(self, site: Any, tls: Any) -> None:
         """Listen for the other relays, and join them.
