@@ -254,6 +254,8 @@ class Forwarder:
         except Unavailable:
             request.transport.abortConnection()
             raise
+        if not status:
+            raise unreachable(relay)
         if status != SWITCHING:
             raise Unavailable(
                 f"the relay that the robot is connected to answered {status} to a request for a shared "

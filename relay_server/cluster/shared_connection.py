@@ -219,12 +219,15 @@ class StreamTransport:
             self._shared.send_control(FrameKind.PAUSE, self.number)
 
     def _pass_on(self, data: bytes) -> None:
-        if self.disconnecting:
-            return
+        if not self.disconnecting:
+            self.guarded(self.protocol.dataReceived, data)
+
+    def guarded(self, call: Callable[..., object], *arguments: object) -> None:
+        """Call what may fail because of this stream alone; then it ends, and not the shared connection."""
         try:
-            self.protocol.dataReceived(data)
+            call(*arguments)
         except Exception:
-            self._shared.log.failure("bytes of a stream could not be handled; it is closed")
+            self._shared.log.failure("a stream of another relay failed; it is closed")
             self.loseConnection()
 
     def held(self, paused: bool) -> None:
@@ -238,10 +241,7 @@ class StreamTransport:
         if self._producer is None or pause == self._producer_paused:
             return
         self._producer_paused = pause
-        if pause:
-            self._producer.pauseProducing()
-        else:
-            self._producer.resumeProducing()
+        self.guarded(self._producer.pauseProducing if pause else self._producer.resumeProducing)
 
     def ended(self) -> None:
         """The other relay has closed the stream; what waits is read first."""
@@ -255,7 +255,7 @@ class StreamTransport:
         protocol, self.protocol, self._producer = self.protocol, None, None
         self._unread.clear()
         if protocol is not None:
-            protocol.connectionLost(Failure(ConnectionDone()))
+            self.guarded(protocol.connectionLost, Failure(ConnectionDone()))
 
 
 class SharedConnection(TwistedProtocol):
@@ -462,14 +462,14 @@ class SharedConnection(TwistedProtocol):
             self.send_control(FrameKind.END, number)
             return
         stream = self._streams[number] = StreamTransport(self, number, protocol)
-        protocol.makeConnection(stream)
+        stream.guarded(protocol.makeConnection, stream)
 
 
 class SharedConnectionRequest(TwistedProtocol):
     """Asks another relay for a :class:`SharedConnection` over a new TCP connection.
 
     :param head: the request (RFC 9110 section 7.8)
-    :param done: gets the answered status; after 101 the connection is in use
+    :param done: gets the answered status, 0 if there is none; after 101 the connection is in use
     """
 
     transport: Any
@@ -512,7 +512,7 @@ class SharedConnectionRequest(TwistedProtocol):
         if self._accepted:
             self._shared.connectionLost(reason)
         else:
-            self._done(502)
+            self._done(0)
 
 
 def _nothing() -> None:

@@ -251,17 +251,34 @@ def test_a_protocol_that_fails_ends_its_stream_alone() -> None:
     assert (home.lost, other.came) == (1, b"y")
 
 
-def _fail(data: bytes) -> None:
+def _fail(*_: object) -> None:
     raise ZeroDivisionError
+
+
+def test_a_stream_that_fails_at_its_beginning_ends_alone() -> None:
+    pair = Pair()
+    door, home = pair.opened()
+    refused, begun = Peer(), Peer()
+    broken = Peer()
+    broken.makeConnection = _fail  # type: ignore[method-assign]
+    pair.home._accept = lambda _: broken
+    pair.door.open(refused)
+    pair.moves()
+    pair.home._accept = pair._accept
+    pair.door.open(begun)
+    door.transport.write(b"x")
+    pair.moves()
+    assert (refused.lost, begun.lost, home.came) == (1, 0, b"x")
 
 
 def test_the_end_of_the_connection_ends_all_streams() -> None:
     pair = Pair()
     ends = [pair.opened() for _ in range(3)]
+    ends[0][0].connectionLost = _fail  # type: ignore[method-assign]
     notes: list[str] = []
     pair.door.on_lost = lambda: notes.append("lost")
     pair.door.connectionLost()
-    assert ([door.lost for door, _ in ends], notes) == ([1, 1, 1], ["lost"])
+    assert ([door.lost for door, _ in ends], notes) == ([0, 1, 1], ["lost"])
 
 
 def test_the_relay_that_connected_opens_streams_alone() -> None:
@@ -295,6 +312,7 @@ def test_a_relay_accepts_the_connection_or_not(answer: bytes, status: int) -> No
     lost: list[bool] = []
     shared.on_lost = lambda: lost.append(True)
     request.connectionLost()
+    assert statuses == ([status] if status == 101 else [status, 0])
     assert lost == ([True] if status == 101 else [])
 
 
