@@ -6,7 +6,6 @@ A message for many clients is framed once: sessions give whole frames to their t
 
 from __future__ import annotations
 
-import os
 import struct
 
 try:
@@ -22,6 +21,8 @@ PING = 0x89
 PONG = 0x8A
 FIN = 0x80
 
+_MASKED = 0x80
+_NO_MASK = bytes(4)
 _SHORT = struct.Struct("!BB")
 _MEDIUM = struct.Struct("!BBH")
 _LONG = struct.Struct("!BBQ")
@@ -61,21 +62,22 @@ def ping(payload: bytes) -> bytes:
 
 
 def masked(first: int, payload: bytes) -> bytes:
-    """A frame as a client sends it.
+    """A frame as a client sends it, for another relay.
+
+    The mask is zero. Masks protect caches and proxies from what pages choose (RFC 6455 section 10.3), and there are
+    none between relays.
 
     :param first: its first byte, such as :data:`TEXT`
     """
-    head, mask = bytearray(_head(first, len(payload))), os.urandom(4)
-    head[1] |= 0x80
-    return bytes(head) + mask + apply_mask(payload, mask)
+    return _head(first, len(payload), _MASKED) + _NO_MASK + payload
 
 
-def _head(first: int, length: int) -> bytes:
+def _head(first: int, length: int, bit: int = 0) -> bytes:
     if length < 126:
-        return _SHORT.pack(first, length)
+        return _SHORT.pack(first, bit | length)
     if length < 65536:
-        return _MEDIUM.pack(first, 126, length)
-    return _LONG.pack(first, 127, length)
+        return _MEDIUM.pack(first, bit | 126, length)
+    return _LONG.pack(first, bit | 127, length)
 
 
 class Fragments:
