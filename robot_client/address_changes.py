@@ -14,6 +14,7 @@ from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from robot_client.addresses import finds_others, own_addresses
+from robot_client.alerts import MODULE, AlertCondition, OnAlert, ignore_alert
 
 _MADE_AGAIN = (
     "until the daemon's nodes are made again; that is done when the robot stands still and has nothing to do"
@@ -51,9 +52,15 @@ class AddressChanges:
     A change counts when two looks agree, and so does standing still.
 
     :param read: the addresses now
+    :param alert: reports that nodes are not found until people start the robot's nodes again
     """
 
-    def __init__(self, robot: RenewableRobot, read: Callable[[], frozenset[str]] = own_addresses) -> None:
+    def __init__(
+        self,
+        robot: RenewableRobot,
+        read: Callable[[], frozenset[str]] = own_addresses,
+        alert: OnAlert = ignore_alert,
+    ) -> None:
         self._robot = robot
         self._read = read
         self._known = self._latest = read()
@@ -62,6 +69,7 @@ class AddressChanges:
         self._was_idle = False
         self._under_way = False
         self._log = Logger("network")
+        self._lost = AlertCondition(alert, MODULE, "addresses")
 
     def check(self) -> None:
         """Make the participant again if the addresses have changed and the robot stands still."""
@@ -70,19 +78,25 @@ class AddressChanges:
             return
         if self._latest == self._known:
             self._announced = None
+            self._lost.update("", "the machine has its former addresses again, and ROS nodes are found")
             return
         if self._announced != self._latest:
             self._announced = self._latest
             self._was_idle = False
-            self._log.warn(
-                "the machine's addresses have changed ({change}). ROS nodes that start now are not found {until}",
-                change=self._change(),
-                until=_MADE_AGAIN if self._known & self._latest else _LEFT,
-            )
+            self._announce()
         idle = self._robot.is_idle and finds_others(self._known, self._latest, self._robot.nodes)
         if idle and self._was_idle:
             self._renew()
         self._was_idle = idle
+
+    def _announce(self) -> None:
+        words = (
+            f"the machine's addresses have changed ({self._change()}). ROS nodes that start now are not found"
+        )
+        if finds_others(self._known, self._latest, self._robot.nodes):
+            self._log.warn("{words} {until}", words=words, until=_MADE_AGAIN)
+        else:
+            self._lost.update(f"{words} {_LEFT}", "")
 
     def _change(self) -> str:
         words = (("new", self._latest - self._known), ("gone", self._known - self._latest))
@@ -105,6 +119,7 @@ class AddressChanges:
         self._robot.renew_platform(reason)
         self._known = addresses
         self._log.info("the daemon's ROS nodes were made again: {reason}", reason=reason)
+        self._lost.update("", "ROS nodes are found at the machine's new addresses")
 
     def _ended(self, result: object) -> None:
         self._under_way = self._was_idle = False

@@ -121,7 +121,9 @@ class DaemonProcess:
             agent=agent(),
         )
         self._address_changes = PeriodicTasks(
-            [(AddressChanges(self).check, CHECK_SECONDS)] if self.platform.depends_on_addresses() else [],
+            [(AddressChanges(self, alert=self._alert).check, CHECK_SECONDS)]
+            if self.platform.depends_on_addresses()
+            else [],
             reactor,
         )
         self._notifier = Notifier(reactor, os.environ, lambda: self.platform.fault() is None)

@@ -8,6 +8,7 @@ import io
 import os
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
@@ -23,7 +24,7 @@ class OutputCommand(click.Command):
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         """See :meth:`click.Command.main`."""
-        with _written_output():
+        with written_output():
             return super().main(*args, **kwargs)
 
 
@@ -32,7 +33,12 @@ class OutputGroup(OutputCommand, click.Group):
 
 
 @contextlib.contextmanager
-def _written_output() -> Iterator[None]:
+def written_output() -> Iterator[None]:
+    """The context of a program that writes to standard output.
+
+    :raises SystemExit: with :data:`FAILED`, if that cannot be written
+    """
+    _open_missing()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace" if stream is sys.stdout else "backslashreplace")
@@ -53,6 +59,13 @@ def _written_output() -> Iterator[None]:
         with contextlib.suppress(OSError):
             sys.stderr.write(f"Error: {target} cannot be written: {error.strerror}\n")
         sys.exit(FAILED)
+
+
+def _open_missing() -> None:
+    """What is written to a descriptor that was closed before the start goes nowhere; Python has no stream for it."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
 
 
 def _discard_output() -> None:

@@ -43,9 +43,9 @@ long."""
 ESCAPES_BEYOND = 131_072
 """Backslashes of a text of more than :data:`LARGE` bytes with NaN or infinity, which are looked for outside strings."""
 
-LONG_NUMBER = 1024
+LONG_NUMBER = 320
 """Digits of a number from which on it is not read in a text of more than :data:`COUNTED` bytes: that takes quadratic
-time. No type holds such a number."""
+time. No type holds such a number: the largest of a float64 has 309 digits before the point."""
 
 _STRIDE = 31
 _SAMPLED = b"0" * (LONG_NUMBER // _STRIDE)

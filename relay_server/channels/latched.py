@@ -8,6 +8,7 @@ this, the relay replays as many of the last samples as the topic has publishers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from relay_protocol import limits
@@ -84,7 +85,7 @@ class LatchedSamples:
         self._bytes = 0
         self._joiners: dict[ChannelMember, _Joiner] = {}
         self._fresh_until = 0.0
-        """Samples that come until then are counted as those that publishers keep."""
+        """Samples that come until then are counted as those that publishers keep. Infinite until the first has come."""
         self._fresh: set[int] = set()
         """Their stamps."""
         self._kept_before = 0
@@ -110,7 +111,7 @@ class LatchedSamples:
 
     @property
     def kept(self) -> int:
-        """About how many samples the publishers keep: as many as came when the robot had just subscribed."""
+        """About how many samples the publishers keep: as many as came together when the robot had just subscribed."""
         fresh = len(self._fresh)
         return max(fresh, self._kept_before) if self._clock.seconds() < self._fresh_until else fresh
 
@@ -140,7 +141,7 @@ class LatchedSamples:
         """Count the samples that publishers keep, as the robot is about to send them."""
         self._kept_before = self.kept
         self._fresh.clear()
-        self._fresh_until = self._clock.seconds() + REPLAY_SECONDS
+        self._fresh_until = math.inf
 
     def forget(self) -> None:
         """Drop all samples, as they are no longer those of the topic."""
@@ -273,8 +274,12 @@ class LatchedSamples:
                 joiner.replay(stamp, sample)
 
     def _count(self, stamp: int) -> None:
-        if self._clock.seconds() < self._fresh_until and len(self._fresh) < MAX_SAMPLES:
-            self._fresh.add(stamp)
+        now = self._clock.seconds()
+        if now >= self._fresh_until or len(self._fresh) >= MAX_SAMPLES:
+            return
+        if not self._fresh:
+            self._fresh_until = now + REPLAY_SECONDS
+        self._fresh.add(stamp)
 
     def _note(self, stamp: int) -> None:
         self._came.add(stamp)

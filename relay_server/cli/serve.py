@@ -231,7 +231,7 @@ class ServeOptions:
 @click.option(
     "--data",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Data folder (may also be given before 'serve').",
+    help="Data folder. It and --db URL, a database other than SQLite in it, may stand before 'serve' or behind it.",
 )
 @click.option(
     "--http",

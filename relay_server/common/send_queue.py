@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, Protocol
 
-from relay_protocol.limits import MIB, ROBOT_FRAME
+from relay_protocol.limits import KIB, MIB, ROBOT_FRAME
 
 DATA_BYTES = 2 * MIB
 """Most bytes of samples that wait for one receiver."""
@@ -30,6 +30,12 @@ SLOW_AGE = 0.3
 
 BURST = 4
 """Newest samples of a topic that :data:`SLOW_AGE` does not drop: they may be events, and not a stream."""
+
+MIDDLING = 2 * KIB
+"""On a slow connection a sample of more bytes is sent after smaller ones of other topics."""
+
+MIDDLING_TURN = 16 * KIB
+"""Bytes of small samples that are sent before a middling one that waits longer."""
 
 LARGE_WAIT = 1.0
 """Seconds after which a large sample is sent before small ones; otherwise it could wait for ever."""
@@ -106,6 +112,7 @@ class SendQueue:
     """
 
     __slots__ = (
+        "_before_middling",
         "_closed",
         "_control",
         "_control_bytes",
@@ -166,6 +173,8 @@ class SendQueue:
         self._sending_since: float | None = None
         """Seconds at which the large sample that is being sent was begun."""
         self._delayed_others = False
+        self._before_middling = 0
+        """Bytes of small samples that were sent before a middling one that waits longer."""
         """Whether messages had to wait for it."""
         self._large_allowed_at = 0.0
         """The clock's time at which the next large sample may be sent; 0: at once."""
@@ -276,14 +285,24 @@ class SendQueue:
             small_first = now - max(self._large_since, self._large_allowed_at) <= LARGE_WAIT
         else:
             small_first = True
+        middling = None
         for key, queue in self._data.items():
-            if queue.samples[0][1] <= limit:
-                if small_first or large is None:
+            size = queue.samples[0][1]
+            if size <= limit and (small_first or large is None):
+                if size > MIDDLING and small_first:
+                    middling = key if middling is None else middling
+                    continue
+                if middling is None or self._before_middling < MIDDLING_TURN:
+                    self._before_middling += size if middling is not None else 0
                     return key
-            elif large is None:
+                break
+            if size > limit and large is None:
                 large = key
                 if not small_first:
                     break
+        if middling is not None:
+            self._before_middling = 0
+            return middling
         if large is None or closed_to_large:
             return None
         self._large_since = None

@@ -5,12 +5,14 @@ parts of large samples, one subscription after the other, so that neither delays
 transport is full, each subscription keeps its latest samples (:data:`SUBSCRIPTION_BYTES`), at most 1 s old
 and at most 4 MiB in all. A sample of which a part was sent is always completed.
 
-Of a latched topic the newest samples, as many as it has publishers, are kept, since each may be the only one of
-its publisher; so are samples that are repeated for late joiners (:data:`LATCHED_BYTES`).
+Of a latched topic the newest samples are kept, as many as it has publishers or as came together at first: each
+may be the only one of its publisher, or one of several that it keeps. So are samples that are repeated for late joiners
+(:data:`LATCHED_BYTES`).
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -41,6 +43,9 @@ MIDDLING = 2 * KIB
 
 LARGE = 16 * KIB
 """A sample of more bytes is sent in parts."""
+
+TOGETHER_SECONDS = 0.5
+"""Samples of a latched topic that come within so long after the first one are those that its publishers keep."""
 
 PART = 32 * KIB
 LEAST_PART = 2 * KIB
@@ -217,6 +222,10 @@ class _SubscriptionQueue:
         self.latched = latched
         self.publishers = 1
         """Of the topic; see :attr:`kept`."""
+        self.first = 0
+        """Number of latched samples that came together when the subscription had just begun."""
+        self.first_until = math.inf
+        """Until when they come, seconds; infinite until one has come."""
         self.waiting: deque[int] = deque()
         """Serial numbers of its samples, oldest first."""
         self.size = 0
@@ -244,8 +253,18 @@ class _SubscriptionQueue:
 
     @property
     def kept(self) -> int:
-        """Number of its newest samples that are kept beyond :data:`SUBSCRIPTION_BYTES`."""
-        return max(1, self.publishers) if self.latched else 1
+        """Number of its newest samples that are kept beyond :data:`SUBSCRIPTION_BYTES`.
+
+        One for each publisher; one publisher may keep several, which it sends at the beginning.
+        """
+        return max(1, self.publishers, self.first) if self.latched else 1
+
+    def count_first(self, now: float) -> None:
+        """Count a sample that has come, if it is one of the first."""
+        if not self.first:
+            self.first_until = now + TOGETHER_SECONDS
+        if now < self.first_until:
+            self.first += 1
 
 
 class SampleQueue:
@@ -343,6 +362,8 @@ class SampleQueue:
                 # The sample itself is sent later, and must have the greater stamp then (SPEC 2.5, latched samples).
                 stamp = queue.stamp + 1
         queue.stamp = stamp
+        if queue.latched:
+            queue.count_first(now)
         sample = _Sample(number, now, stamp, body)
         if queue.throttle and now < queue.next_at:
             self.throttled += queue.throttled is None

@@ -17,6 +17,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
+from relay_protocol.command_output import written_output
+
 ANSWER_SECONDS = 10.0
 """Seconds that each command's answer is waited for at the end of the input."""
 
@@ -26,6 +28,11 @@ def main() -> None:
 
     :raises SystemExit: with the exit code of the module
     """
+    with written_output():
+        _run()
+
+
+def _run() -> None:
     if len(sys.argv) not in (2, 3):
         raise SystemExit(
             """usage: python -m robot_client.devices.trial PACKAGE.MODULE:CLASS ['{"port": "/dev/ttyUSB0"}']"""

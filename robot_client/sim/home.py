@@ -15,6 +15,7 @@ import click
 import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
+from relay_protocol.command_output import OutputCommand
 from robot_client.platforms.mqtt.settings import PASSWORD_VARIABLE, MqttSettings
 
 TICK = 0.1
@@ -208,7 +209,7 @@ def connect(settings: MqttSettings, password: str | None, ready: threading.Event
     return home
 
 
-@click.command()
+@click.command(cls=OutputCommand)
 @click.option("--broker", default="127.0.0.1:1883", show_default=True, metavar="HOST:PORT")
 @click.option("--user", default="", help=f"Name at the broker; the password is in {PASSWORD_VARIABLE}.")
 def main(broker: str, user: str) -> None:

@@ -20,6 +20,7 @@ import pgserver
 import psutil
 import psycopg
 import pytest
+from websockets.exceptions import InvalidStatus
 
 from tests.worlds.processes import running
 from tests.worlds.relay_process import Relay
@@ -101,6 +102,8 @@ def test_requests_are_answered_while_the_database_is_frozen(frozen: Frozen) -> N
     with frozen.standing_still(), ThreadPoolExecutor(64) as pool:
         asked = {what: pool.submit(frozen.ask, *request) for what, request in REQUESTS.items()}
         flood = [pool.submit(frozen.ask, *REQUESTS["robots"]) for _ in range(300)]
+        with pytest.raises(InvalidStatus) as refused:
+            frozen.relay.connect("rover", frozen.token)
         answers = {what: each.result() for what, each in asked.items()}
         flooded = {each.result().status_code for each in flood}
     for what, answer in answers.items():
@@ -111,6 +114,7 @@ def test_requests_are_answered_while_the_database_is_frozen(frozen: Frozen) -> N
             assert answer.json()["detail"]
     assert answers["a new event"].status_code == 503
     assert answers["health"].status_code == 503
+    assert refused.value.response.status_code == 503
     assert flooded <= {200, 503}
     wait_for("the database answers", lambda: frozen.ask("GET", "/healthz", None).status_code == 200)
     assert frozen.ask(*REQUESTS["a new event"]).status_code == 201

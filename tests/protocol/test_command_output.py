@@ -79,6 +79,15 @@ def test_a_closed_pipe_ends_the_program_silently(lines: int, capsys: pytest.Capt
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_a_descriptor_that_was_closed_before_the_start_is_no_error(
+    closed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, closed, None)
+    assert code_of("say") == 0
+    getattr(sys, closed).close()
+
+
 def test_other_errors_stay_what_they_are() -> None:
     with pytest.raises(FileNotFoundError):
         fail.main([], prog_name="program")

@@ -76,7 +76,7 @@ SHAPES: dict[str, tuple[Callable[[int], bytes], str]] = {
     "long numbers": (listed(b"0.1234567890123456,"), "a/msg/OfFloat64"),
     "numbers of 4000 digits": (listed(b"1" * 4000 + b","), "a/msg/OfUint64"),
     "floats of 4000 digits": (listed(b"1" * 4000 + b","), "a/msg/OfFloat64"),
-    "numbers of 1000 digits": (listed(b"1" * 1000 + b","), "a/msg/OfUint64"),
+    "numbers of 300 digits": (listed(b"1" * 300 + b","), "a/msg/OfUint64"),
     "wide text": (text(b"A"), "a/msg/Wide"),
     "wide text, two bytes each": (text("ä".encode()), "a/msg/Wide"),
     "wide text of surrogate pairs": (text("😀".encode()), "a/msg/Wide"),
@@ -174,14 +174,14 @@ def test_long_numbers_of_a_large_message_are_refused_unread() -> None:
     """Also where no type says that they are numbers, and not where they stand in a string."""
     long = b"1" * json_cost.LONG_NUMBER
     many = listed(long + b",")(json_cost.LARGE)
-    with pytest.raises(json_cost.TooCostly, match="no number of 1024 digits or more"):
+    with pytest.raises(json_cost.TooCostly, match="no number of 320 digits or more"):
         rosbridge.decode(many)
     for read in (jsontext.decode_any, jsontext.recode):
         with pytest.raises(MalformedMessage, match="a number is out of range"):
             read(many)
     beside = message_of(b'"' + long * 1000 + b'","x":["\\"' + long + b'\\\\",' + b"1," * 1000 + b"1]")
     assert isinstance(rosbridge.decode(beside), rosbridge.Publish)
-    assert isinstance(rosbridge.decode(listed(b"1" * 1023 + b",")(json_cost.LARGE)), rosbridge.Publish)
+    assert isinstance(rosbridge.decode(listed(b"1" * 319 + b",")(json_cost.LARGE)), rosbridge.Publish)
 
 
 def test_a_wide_text_that_is_too_long_is_refused_by_its_length() -> None:

@@ -8,6 +8,7 @@ from twisted.logger import formatEvent, globalLogPublisher
 
 from robot_client.address_changes import AddressChanges
 from robot_client.addresses import CHECK_SECONDS, AddressWatch, own_addresses
+from robot_client.alerts import MODULE
 
 HOME, AWAY, VPN = "wlan0 10.0.0.5", "wlan0 10.9.0.7", "tun0 10.8.0.2"
 
@@ -22,7 +23,12 @@ class Robot:
         self.fails = False
         self.released: Deferred[object] | None = None
         self.renewals: list[str] = []
-        self.changes = AddressChanges(self, lambda: self.addresses)
+        self.alerts: list[tuple[str, str, bool]] = []
+        self.changes = AddressChanges(self, lambda: self.addresses, self.alert)
+
+    def alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+        assert (kind, about) == (MODULE, "addresses")
+        self.alerts.append((level, text, over))
 
     def release_platform(self, reason: str) -> Deferred[object]:
         return succeed(None) if self.released is None else self.released
@@ -118,17 +124,27 @@ def test_change_is_logged_in_words(robot: Robot) -> None:
     said: list[str] = []
     globalLogPublisher.addObserver(observer := lambda event: said.append(formatEvent(event)))
     try:
-        robot.nodes = frozenset({"/base"})
         robot.has(AWAY, VPN, checks=20)
-        assert [each.partition(" ROS ")[0] for each in said] == [
-            f"the machine's addresses have changed (new: {VPN}, {AWAY}; gone: {HOME})."
-        ]
-        assert "Start the robot's ROS nodes again" in said[0]
-        robot.nodes = frozenset()
-        robot.has(AWAY, VPN)
+        changed = f"the machine's addresses have changed (new: {VPN}, {AWAY}; gone: {HOME})."
+        assert said[0].partition(" ROS ")[0] == changed
+        assert "when the robot stands still" in said[0]
     finally:
         globalLogPublisher.removeObserver(observer)
     assert said[1:] == ["the daemon's ROS nodes were made again: the machine's addresses have changed"]
+    assert robot.alerts == []
+
+
+@pytest.mark.parametrize("end", ["nodes", "address"])
+def test_nodes_that_have_to_be_started_again_are_an_alert(robot: Robot, end: str) -> None:
+    """Until they were, or a former address is back."""
+    robot.nodes = frozenset({"/base"})
+    robot.has(AWAY, checks=20)
+    ((level, text, over),) = robot.alerts
+    assert (level, "Start the robot's ROS nodes again" in text, over) == ("error", True, False)
+    if end == "nodes":
+        robot.nodes = frozenset()
+    robot.has(AWAY if end == "nodes" else HOME)
+    assert [each[2] for each in robot.alerts] == [False, True]
 
 
 def test_own_addresses_have_no_loopback() -> None:

@@ -99,8 +99,9 @@ class BatteryReader:
             return None
         charge = float(state.percentage)
         known = 0.0 <= charge <= 1.0
-        # NaN is not measured (sensor_msgs/BatteryState).
-        self._report_range(charge, out_of_range=not known and not math.isnan(charge))
+        # NaN is not measured (sensor_msgs/BatteryState), so it is neither in range nor out of it.
+        if not math.isnan(charge):
+            self._report_range(charge, out_of_range=not known)
         return charge if known else None
 
     def _report_range(self, charge: float, out_of_range: bool) -> None:

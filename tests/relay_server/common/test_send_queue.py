@@ -413,3 +413,30 @@ def test_a_sample_of_each_publisher_of_a_latched_topic_arrives() -> None:
     for n in range(20):
         receiver.outbox.send_droppable("map", bytes([n]) * MIB, lasting=Lasting(20, all_ages=True))
     assert [each[0] for each in receiver.resume()] == list(range(4, 20))
+
+
+def middling_wait(receiver: Receiver) -> None:
+    """Ten topics of 20 kB wait on a slow connection."""
+    receiver.outbox.set_limits(30_000, 300_000.0)
+    for n in range(10):
+        receiver.outbox.send_droppable(f"middling {n}", b"m%d" % n + bytes(20_000))
+
+
+def test_small_samples_pass_middling_ones_on_a_slow_connection() -> None:
+    receiver = paused()
+    middling_wait(receiver)
+    receiver.outbox.send_droppable("pose", b"pose")
+    got = receiver.resume()
+    assert got[0] == b"pose"
+    assert [each[:2] for each in got[1:]] == [b"m%d" % n for n in range(10)]
+
+
+def test_middling_samples_come_in_turn_with_many_small_ones() -> None:
+    receiver = paused()
+    middling_wait(receiver)
+    for n in range(100):
+        receiver.outbox.send_droppable(f"small {n}", b"s" * 1000)
+    got = [each[:1] for each in receiver.resume()]
+    assert got.index(b"m") in range(10, 20)
+    assert got[:80].count(b"m") == 4
+    assert (got.count(b"m"), got.count(b"s")) == (10, 100)

@@ -423,9 +423,11 @@ def test_each_subscription_keeps_its_order(sent: list[tuple[int, int]], room: in
 
 def test_a_latched_sample_of_each_publisher_survives_a_full_transport() -> None:
     """However large they are together, within a bound; more than the topic has publishers are replaced as others."""
-    queue = sample_queue(Clock())
+    clock = Clock()
+    queue = sample_queue(clock)
     queue.open(1, latched=True, publishers=10)
     queue.open(2)
+    has_begun(queue, clock)
     queue.paused = True
     for number in range(12):
         queue.enqueue(1, number, bytes([number]) * 500_000)
@@ -442,10 +444,41 @@ def test_a_latched_sample_of_each_publisher_survives_a_full_transport() -> None:
     assert [body[0] for body in bodies(queue)] == list(range(2, 10))
 
 
+def has_begun(queue: SampleQueue, clock: Clock) -> None:
+    """What the publishers of a latched topic kept has come, and some time has passed."""
+    queue.enqueue(1, 0, b"kept")
+    assert b"kept" in bodies(queue)
+    clock.advance(1)
+
+
+def test_all_latched_samples_of_one_publisher_survive_a_full_transport() -> None:
+    """They come together when the subscription has just begun. What comes later is replaced by what is newer."""
+    clock = Clock()
+    queue = sample_queue(clock)
+    queue.open(1, latched=True)
+    clock.advance(5)
+    queue.paused = True
+    for number in range(10):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+    queue.trim()
+    queue.paused = False
+    assert [body[0] for body in bodies(queue)] == list(range(10))
+    queue = sample_queue(clock)
+    queue.open(1, latched=True)
+    has_begun(queue, clock)
+    queue.paused = True
+    for number in range(10):
+        queue.enqueue(1, number, bytes([number]) * 500_000)
+    queue.paused = False
+    assert [body[0] for body in bodies(queue)] == [9]
+
+
 def test_repeated_samples_survive_a_full_transport_too() -> None:
     """They are of several publishers, and newer samples do not replace them."""
-    queue = sample_queue(Clock())
+    clock = Clock()
+    queue = sample_queue(clock)
     queue.open(1, latched=True, publishers=2)
+    has_begun(queue, clock)
     queue.paused = True
     for number in range(1, 5):
         queue.enqueue_latched(1, number, bytes([number]) * 500_000)
