@@ -182,6 +182,7 @@ class Forwarder:
         self._flushes = FlushScheduler(reactor)
         self._shared: dict[str, SharedConnection] = {}
         """Open shared connections by the id of the other relay."""
+        self._closed = False
         self._connecting: dict[str, list[Deferred[SharedConnection]]] = {}
         """Those that wait for one, by the id of the other relay."""
 
@@ -204,7 +205,9 @@ class Forwarder:
 
     async def close(self) -> None:
         """Close idle connections, and the shared ones."""
-        for each in list(self._shared.values()):
+        self._closed = True
+        shared, self._shared = self._shared, {}
+        for each in shared.values():
             each.close()
         await self._pool.closeCachedConnections()
 
@@ -265,7 +268,10 @@ class Forwarder:
 
     def _connected(self, result: SharedConnection | Failure, relay: RelayInfo) -> None:
         if isinstance(result, SharedConnection):
-            self._shared[relay.id] = result
+            if self._closed:
+                result.close()
+            else:
+                self._shared[relay.id] = result
             result.on_lost = lambda: self._shared.pop(relay.id, None)
         for each in self._connecting.pop(relay.id):
             if not each.called:

@@ -32,7 +32,7 @@ from twisted.python.failure import Failure
 from zope.interface import implementer
 
 from relay_protocol.limits import KIB, MIB
-from relay_server.common.clock import Clock
+from relay_server.common.clock import Clock, Timer, cancel
 from relay_server.common.socket_writer import FlushScheduler, writer_for
 from relay_server.common.tcp import PushProducer, enable_tcp_keepalive, tcp_of
 
@@ -55,6 +55,9 @@ BUFFER_BYTES = 256 * KIB
 
 UNREAD_BYTES = 64 * KIB
 """Bytes that wait for a stream that is not read, after which the other relay is asked to pause it."""
+
+READ_SECONDS = 20.0
+"""Seconds in which the last bytes of a stream that has ended must be read."""
 
 MOST_UNREAD_BYTES = 64 * MIB
 """The same, after which the stream ends: the other relay did not pause it. One message may be large."""
@@ -80,7 +83,9 @@ class FrameKind(IntEnum):
     """The sender takes no more bytes for now."""
     RESUME = 4
     END = 5
-    """The sender has closed it."""
+    """The sender has closed it, behind its bytes."""
+    ABORT = 6
+    """The sender has dropped it; what waits to be read is of no use."""
 
 
 class _HeldFrame:
@@ -129,6 +134,8 @@ class StreamTransport:
         self._asked_to_pause = False
         self._over = False
         """Whether no byte can come any more."""
+        self._read_by: Timer | None = None
+        """Ends a stream that is over, and whose last bytes are not read."""
 
     # --- ITransport, IConsumer ----------------------------------------------------------------------------
 
@@ -143,11 +150,16 @@ class StreamTransport:
 
     def loseConnection(self) -> None:
         """Close the stream behind what was written."""
+        self._close(FrameKind.END)
+
+    def abortConnection(self) -> None:
+        """Drop the stream, also at the other relay."""
+        self._close(FrameKind.ABORT)
+
+    def _close(self, kind: FrameKind) -> None:
         if not self.disconnecting:
             self.disconnecting = True
-            self._shared.close_stream(self)
-
-    abortConnection = loseConnection
+            self._shared.close_stream(self, kind)
 
     def getPeer(self) -> Any:
         """The address of the other relay."""
@@ -246,11 +258,15 @@ class StreamTransport:
     def ended(self) -> None:
         """The other relay has closed the stream; what waits is read first."""
         self._over = True
-        if not self._unread:
+        if self._unread:
+            self._read_by = self._shared.clock.callLater(READ_SECONDS, self.lost)
+        else:
             self.lost()
 
     def lost(self) -> None:
         """The stream is over."""
+        cancel(self._read_by)
+        self._shared.forget(self)
         self.disconnecting = True
         protocol, self.protocol, self._producer = self.protocol, None, None
         self._unread.clear()
@@ -278,7 +294,10 @@ class SharedConnection(TwistedProtocol):
         self.on_lost: Callable[[], object] = _nothing
         self._flushes = flushes
         self._accept = accept
+        self._lost = False
         self._streams: dict[int, StreamTransport] = {}
+        self._ending: set[StreamTransport] = set()
+        """Those that the other relay has ended, and whose last bytes are not read yet."""
         self._opened = 0
         self._rest = b""
         self._numbers: tuple[int, ...] = ()
@@ -310,8 +329,9 @@ class SharedConnection(TwistedProtocol):
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """All streams are over."""
-        streams, self._streams = list(self._streams.values()), {}
-        self._held.clear()
+        streams, self._streams = [*self._streams.values(), *self._ending], {}
+        self._lost = True
+        self._clear()
         self.on_lost()
         for each in streams:
             each.lost()
@@ -326,10 +346,13 @@ class SharedConnection(TwistedProtocol):
 
     def _set_full(self, full: bool) -> None:
         self.full = full
-        for each in list(self._streams.values()):
+        for number, each in list(self._streams.items()):
             if self.full is not full:
                 # What the streams before wrote has changed it.
                 break
+            if not full and self._streams.get(number) is each:
+                # The next time it comes after those that had no turn now.
+                self._streams[number] = self._streams.pop(number)
             each.update_producer()
 
     def open(self, protocol: Any) -> StreamTransport:
@@ -337,7 +360,7 @@ class SharedConnection(TwistedProtocol):
         self._opened += 1
         stream = self._streams[self._opened] = StreamTransport(self, self._opened, protocol)
         self.send_control(FrameKind.OPEN, stream.number)
-        protocol.makeConnection(stream)
+        stream.guarded(protocol.makeConnection, stream)
         return stream
 
     # --- sending ------------------------------------------------------------------------------------------
@@ -365,10 +388,11 @@ class SharedConnection(TwistedProtocol):
                 self._by_data.pop(id(last.data), None)
                 last.more.append(data)
             else:
+                if self._held_bytes >= JOINED_BYTES:
+                    # Not behind the piece that reached the limit: other streams may get the same.
+                    self._flush()
                 self._by_data[id(data)] = self._hold(FrameKind.DATA, number, data)
         self._held_bytes += len(data)
-        if self._held_bytes >= JOINED_BYTES:
-            self._flush()
 
     def send_control(self, kind: FrameKind, number: int) -> None:
         """Send a frame without data, in order with the others."""
@@ -384,22 +408,33 @@ class SharedConnection(TwistedProtocol):
         return held
 
     def _flush(self) -> None:
+        held = self._clear()
+        if held:
+            self._write(b"".join(part for each in held for part in each.parts()))
+
+    def _clear(self) -> list[_HeldFrame]:
         held, self._held = self._held, []
         self._by_data.clear()
         self._latest.clear()
         self._held_bytes = 0
-        if held:
-            self._write(b"".join(part for each in held for part in each.parts()))
+        return held
 
     def _write(self, data: bytes) -> None:
+        if self._lost:
+            return
         self._writer.write(data)
         self._writer.flush()
 
-    def close_stream(self, stream: StreamTransport) -> None:
+    def close_stream(self, stream: StreamTransport, kind: FrameKind) -> None:
         """End a stream of this side; its protocol learns of it in a reactor turn of its own."""
-        if self._streams.pop(stream.number, None) is not None:
-            self.send_control(FrameKind.END, stream.number)
+        if self._streams.get(stream.number) is stream:
+            del self._streams[stream.number]
+            self.send_control(kind, stream.number)
         self.clock.callLater(0, stream.lost)
+
+    def forget(self, stream: StreamTransport) -> None:
+        """The stream is over."""
+        self._ending.discard(stream)
 
     # --- receiving ----------------------------------------------------------------------------------------
 
@@ -428,9 +463,8 @@ class SharedConnection(TwistedProtocol):
                 break
             numbers = unpack_from(f"!{count}I", data, start)
             at = end
-            if kind == FrameKind.DATA:
-                self._numbers, self._left = numbers, length
-            else:
+            self._numbers, self._left = numbers if kind == FrameKind.DATA else (), length
+            if kind != FrameKind.DATA:
                 for number in numbers:
                     self._control(kind, number)
         self._rest = data[at:]
@@ -452,13 +486,21 @@ class SharedConnection(TwistedProtocol):
             return
         if kind == FrameKind.END:
             del self._streams[number]
+            self._ending.add(stream)
             stream.ended()
+        elif kind == FrameKind.ABORT:
+            del self._streams[number]
+            stream.lost()
         elif kind in (FrameKind.PAUSE, FrameKind.RESUME):
             stream.held(kind == FrameKind.PAUSE)
 
     def _open_accepted(self, number: int) -> None:
+        if number in self._streams:
+            self.log.error("another relay opened a stream twice")
+            self.transport.abortConnection()
+            return
         protocol = None if self._accept is None else self._accept(self.transport.getPeer())
-        if protocol is None or number in self._streams:
+        if protocol is None:
             self.send_control(FrameKind.END, number)
             return
         stream = self._streams[number] = StreamTransport(self, number, protocol)

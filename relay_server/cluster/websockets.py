@@ -370,8 +370,9 @@ class _HomeConnection(TwistedProtocol):
         """Pass frames on from now on."""
         self._started = True
         rest, self._head = self._head, b""
-        self._frames(rest)
         self.transport.resumeProducing()
+        # They may pause it again.
+        self._frames(rest)
 
     def _frames(self, data: bytes) -> None:
         """Pass frames on, and stop at a close frame."""

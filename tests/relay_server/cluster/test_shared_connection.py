@@ -16,6 +16,7 @@ from relay_server.cluster.shared_connection import (
     JOINED_BYTES,
     MOST_NUMBERS,
     MOST_UNREAD_BYTES,
+    READ_SECONDS,
     UNREAD_BYTES,
     SharedConnection,
     SharedConnectionRequest,
@@ -120,15 +121,16 @@ def test_each_stream_gets_its_bytes_in_order_however_they_are_divided(seed: int)
             assert end.came == sent[id(end)]
 
 
-def test_what_many_streams_get_is_sent_once() -> None:
+@pytest.mark.parametrize("size", [1000, 10_000, 100_000])
+def test_what_many_streams_get_is_sent_once(size: int) -> None:
     pair = Pair()
     homes = [pair.opened()[1] for _ in range(MOST_NUMBERS + 10)]
     pair.bytes_down = 0
-    sample = bytes(10_000)
+    sample = bytes(size)
     for home in homes:
         home.transport.write(sample)
     pair.moves()
-    assert pair.bytes_down < 3 * len(sample) + 4 * len(homes)
+    assert pair.bytes_down < 3 * len(sample) + 5 * len(homes)
     # The order of a stream comes before what can be shared.
     pair.bytes_down = 0
     first, second = homes[:2]
@@ -166,8 +168,10 @@ def test_small_messages_are_sent_at_once_and_those_that_follow_in_one_piece() ->
 def test_much_is_sent_before_the_end_of_the_turn() -> None:
     """So that it is known soon if the transport is full."""
     pair = Pair()
-    _, home = pair.opened()
+    (_, home), (_, other) = pair.opened(), pair.opened()
     home.transport.write(bytes(JOINED_BYTES))
+    assert pair.wires[1].value() == b""
+    other.transport.write(b"next")
     assert len(pair.wires[1].value()) > JOINED_BYTES
 
 
@@ -201,6 +205,60 @@ def test_a_full_connection_pauses_all_its_streams() -> None:
     assert all(flow.paused for flow in flows)
     producer.resumeProducing()
     assert not any(flow.paused for flow in flows)
+
+
+def test_streams_of_a_full_connection_have_their_turn() -> None:
+    """Each writes as much as it may when it is resumed."""
+    pair = Pair()
+    homes = [pair.opened()[1] for _ in range(6)]
+    producer = pair.wires[1].producer
+    turns = [0] * len(homes)
+
+    class Greedy(Flow):
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def resumeProducing(self) -> None:
+            turns[self.number] += 1
+            if sum(turns) % 2 == 0:
+                producer.pauseProducing()
+
+    producer.pauseProducing()
+    for number, home in enumerate(homes):
+        home.transport.registerProducer(Greedy(number), True)
+    for _ in range(30):
+        producer.resumeProducing()
+        producer.pauseProducing()
+    assert max(turns) - min(turns) <= 1
+
+
+def test_a_stream_that_is_aborted_ends_at_once_though_it_is_not_read() -> None:
+    pair = Pair()
+    door, home = pair.opened()
+    door.transport.pauseProducing()
+    home.transport.write(bytes(70_000))
+    pair.moves()
+    home.transport.abortConnection()
+    pair.moves()
+    assert (door.came, door.lost, home.lost) == (b"", 1, 1)
+
+
+@pytest.mark.parametrize("end", ["late", "lost"])
+def test_the_last_bytes_of_a_stream_are_not_kept_for_ever(end: str) -> None:
+    pair = Pair()
+    door, home = pair.opened()
+    door.transport.pauseProducing()
+    home.transport.write(b"last words")
+    home.transport.loseConnection()
+    pair.moves()
+    assert door.lost == 0
+    if end == "late":
+        pair.clock.advance(READ_SECONDS)
+    else:
+        pair.door.connectionLost()
+    assert door.lost == 1
+    pair.clock.advance(READ_SECONDS)
+    assert (door.lost, pair.door._ending) == (1, set())
 
 
 def test_a_stream_that_is_never_paused_is_ended() -> None:
@@ -287,7 +345,9 @@ def test_the_relay_that_connected_opens_streams_alone() -> None:
     pair.home.open(unwanted)
     pair.moves()
     assert (pair.door._streams, unwanted.lost) == ({}, 1)
-    pair.home.dataReceived(pack("!BHII", 2, 1, 3, 99) + b"abc")
+    pair.home.dataReceived(pack("!BHII", 2, 1, 3, 99) + b"abc" + pack("!BHII", 77, 1, 3, 1) + b"abc")
+    assert not pair.wires[1].disconnecting
+    pair.home.dataReceived(b"")
     pair.home.dataReceived(pack("!BHI", 2, MOST_NUMBERS + 1, 0))
     assert pair.wires[1].disconnected
 
