@@ -210,9 +210,8 @@ def hold_joystick(page: Page, dx: float = 0, dy: float = -60) -> None:
 
 def hold_resume(page: Page) -> None:
     """Holds the button that resumes a stopped robot."""
-    box = seen(page, "resume").bounding_box()
-    assert box is not None
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    # It waits until the button stands still, as the banner may still grow.
+    seen(page, "resume").hover()
     page.mouse.down()
     expect(seen(page, "stopped")).to_have_count(0)
     page.mouse.up()
