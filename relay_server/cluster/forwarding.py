@@ -42,10 +42,11 @@ from relay_server.cluster.homes import RobotHomes
 from relay_server.cluster.relays import RelayInfo, check_compatible, lost, unreachable
 from relay_server.cluster.shared_connection import UPGRADE, SharedConnection, SharedConnectionRequest
 from relay_server.common import close_codes
-from relay_server.common.clock import Clock, sleep
+from relay_server.common.clock import Clock, Timer, cancel, sleep
 from relay_server.common.concurrency import detached, with_timeout
 from relay_server.common.freshness_tokens import HEADER as FRESHNESS
 from relay_server.common.socket_writer import FlushScheduler
+from relay_server.common.tcp import NewsFlow, PushProducer
 from relay_server.config import ClusterSettings
 from relay_server.robots.registry import RobotRegistry
 
@@ -67,6 +68,9 @@ ANYTHING = "/api/v1/cluster/alive"
 """A path that is answered without the database; any answer will do."""
 SHARED = "/api/v1/cluster/streams"
 """A path for the requests for shared connections; what counts is the field ``Upgrade``."""
+STALL_SECONDS = 30.0
+"""Seconds without progress after which a client that takes no more of its answer is cut. While it takes nothing, the
+end of the home's connection is not seen."""
 IDLE_CONNECTIONS = 16
 """Most idle connections that are kept to another relay."""
 
@@ -82,6 +86,9 @@ _CREDENTIALS = frozenset(
 
 _CREDENTIAL_PARAMETERS = frozenset({"ticket", "token"})
 """Parameters that the home does not get."""
+
+_NEWEST_COUNTS = frozenset({b"multipart/x-mixed-replace", b"text/event-stream"})
+"""Types of streams."""
 
 _OF_FIRST_RELAY = _OF_CONNECTION | {b"cross-origin-resource-policy"}
 """Fields of the home's answer that the client does not get: whether it used a ticket is known to the first relay."""
@@ -463,7 +470,7 @@ class Forwarder:
             elif name.lower() not in _OF_FIRST_RELAY:
                 request.responseHeaders.setRawHeaders(name, values)
         if request.method != b"HEAD":
-            await _AnswerPipe(request).run(response)
+            await _AnswerPipe(request, self._reactor).run(response)
         return True
 
 
@@ -576,12 +583,19 @@ class _AnswerLines(TwistedProtocol):
 
 
 class _AnswerPipe(TwistedProtocol):
-    """Writes the body of an answer to the request that it answers, as fast as its client reads."""
+    """Writes the body of an answer to the request that it answers, as fast as its client reads.
+
+    Of streams whose newest part counts little waits here, so that the home can drop what comes too late.
+    """
 
     transport: Any
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: Request, clock: Any) -> None:
         self._request = request
+        self._clock = clock
+        self._flow: PushProducer = PushProducer(self)
+        self._news: NewsFlow | None = None
+        self._stalled: Timer | None = None
         self._done: Deferred[None] = Deferred(self._stop)
 
     async def run(self, response: Any) -> None:
@@ -589,14 +603,39 @@ class _AnswerPipe(TwistedProtocol):
 
         :raises ConnectionError: it was cut
         """
+        (kind,) = response.headers.getRawHeaders(b"content-type", [b""])[:1]
+        if kind.partition(b";")[0] in _NEWEST_COUNTS:
+            self._flow = self._news = NewsFlow(self, self._clock, self._request.transport)
         response.deliverBody(self)
-        await self._done
+        try:
+            await self._done
+        finally:
+            cancel(self._stalled)
+            if self._news is not None:
+                self._news.end()
 
     def _stop(self, _: object) -> None:
         self.transport.stopProducing()
 
+    def pause(self) -> None:
+        """The client's transport is full."""
+        cancel(self._stalled)
+        self._stalled = self._clock.callLater(STALL_SECONDS, self._stall)
+        self.transport.pauseProducing()
+
+    def resume(self) -> None:
+        """The client takes bytes again."""
+        cancel(self._stalled)
+        self.transport.resumeProducing()
+
+    def _stall(self) -> None:
+        if self._news is not None and self._news.made_progress():
+            self._stalled = self._clock.callLater(STALL_SECONDS, self._stall)
+        else:
+            self._request.transport.abortConnection()
+
     def connectionMade(self) -> None:
-        self._request.registerProducer(self.transport, True)
+        self._request.registerProducer(self._flow, True)
 
     def dataReceived(self, data: bytes) -> None:
         self._request.write(data)

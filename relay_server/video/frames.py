@@ -112,6 +112,9 @@ CONTENT_TYPES = {"jpeg": b"image/jpeg", "png": b"image/png"}
 STALL_SECONDS = 5.0
 """Seconds without any byte accepted after which a viewer is cut."""
 
+FORWARDED_STALL_SECONDS = 20.0
+"""The same of a viewer at another relay, which accepts more at a time, and that less often."""
+
 CHECK_SECONDS = 1.0
 """How often stalled viewers are looked for."""
 

@@ -19,6 +19,7 @@ from relay_server.common.tcp import PushProducer
 from relay_server.video.frames import (
     CHECK_SECONDS,
     CONTENT_TYPES,
+    FORWARDED_STALL_SECONDS,
     STALL_SECONDS,
     AckTracker,
     FrameQueue,
@@ -80,6 +81,8 @@ class Multipart:
         self._rendered = rendered
         self._request = request
         self._transport: Any = request.channel.transport
+        forwarded = getattr(request, "forwarded_client", None) is not None
+        self._stall_seconds = FORWARDED_STALL_SECONDS if forwarded else STALL_SECONDS
         self._tcp: Any = None
         self._acks = AckTracker(None, clock.seconds)
         self._writer: TransportWriter | None = None
@@ -171,7 +174,7 @@ class Multipart:
 
     def _check(self) -> None:
         stands = self._acks.stalled_for()
-        if stands >= STALL_SECONDS and (self._full or self._acks.in_flight):
+        if stands >= self._stall_seconds and (self._full or self._acks.in_flight):
             self._close(abort=True)
 
     def _stop_timers(self) -> None:
