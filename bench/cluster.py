@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from relay_protocol import identity, jsontext, link
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.auth import passwords
 from relay_server.cli import main
+from tests.worlds.chaos_proxy import ChaosProxy
 from tests.worlds.nats_servers import NatsServer, nats_cluster
 from tests.worlds.processes import running
 from tests.worlds.waiting import wait_for
@@ -82,9 +83,17 @@ def database() -> Iterator[str]:
 
 
 def start_relays(
-    stack: contextlib.ExitStack, folder: Path, url: str, bus: list[NatsServer], heartbeat: str
+    stack: contextlib.ExitStack,
+    folder: Path,
+    url: str,
+    bus: list[NatsServer],
+    heartbeat: str,
+    links: Sequence[ChaosProxy] = (),
 ) -> list[ClusterRelay]:
-    """Three relays, which end with the stack."""
+    """Three relays, which end with the stack.
+
+    :param links: networks by which the others reach each of them, with twin ports
+    """
     folder.mkdir()
     secret = folder / "secret"
     secret.write_text("0123456789abcdef" * 2 + "\n")
@@ -92,8 +101,12 @@ def start_relays(
     options += ["--name", NAME, "--heartbeat", heartbeat, "--requests-per-second", "0"]
     options += ["--connections-per-network", "0"]
     relays = []
-    for name in ("one", "two", "three"):
-        relay = ClusterRelay(folder / name, *options, database=url)
+    for at, name in enumerate(("one", "two", "three")):
+        more = []
+        if links:
+            port = links[at].port
+            more = ["--cluster-listen", f"127.0.0.1:{port}", "--cluster-host", "127.0.0.2"]
+        relay = ClusterRelay(folder / name, *options, *more, database=url)
         stack.enter_context(running(relay))
         relays.append(relay)
     return relays

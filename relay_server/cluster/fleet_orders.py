@@ -15,7 +15,13 @@ from relay_protocol import jsontext
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.access import Principal
-from relay_server.cluster.forwarding import ForwardedClient, Forwarder, RelayAnswer
+from relay_server.cluster.forwarding import (
+    STOP_WATCH_SECONDS,
+    WATCH_SECONDS,
+    ForwardedClient,
+    Forwarder,
+    RelayAnswer,
+)
 from relay_server.cluster.homes import RobotHomes
 from relay_server.cluster.relays import RelayInfo
 from relay_server.fleet.order import Order, TaskOutcome, body_of
@@ -182,7 +188,8 @@ class ClusterOrders:
 
     def _ask(self, sent: _OrderToHome, client: ForwardedClient, token: str = "") -> Awaitable[RelayAnswer]:
         body = body_of(sent.order, sent.robots)
-        return self._forwarder.ask_lines(PATH, body, sent.relay, client, token, sent.answered)
+        watch_seconds = STOP_WATCH_SECONDS if sent.order.do == "stop" else WATCH_SECONDS
+        return self._forwarder.ask_lines(PATH, body, sent.relay, client, token, sent.answered, watch_seconds)
 
 
 def _object(line: bytes) -> dict[str, Any]:

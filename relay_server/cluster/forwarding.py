@@ -64,6 +64,8 @@ FORWARDED_SECONDS = 600.0
 """Additional time of a request that another relay answers, which has time limits of its own."""
 WATCH_SECONDS = 5.0
 """Seconds between short requests to a relay whose answer is waited for, and in which it must answer them."""
+STOP_WATCH_SECONDS = 0.5
+"""The same while a stop waits, which is stored in the database if the relay is silent."""
 ANYTHING = "/api/v1/cluster/alive"
 """A path that is answered without the database; any answer will do."""
 SHARED = "/api/v1/cluster/streams"
@@ -316,17 +318,19 @@ class Forwarder:
         client: ForwardedClient,
         token: str,
         on_line: Callable[[bytes], None],
+        watch_seconds: float = WATCH_SECONDS,
     ) -> RelayAnswer:
         """As :meth:`ask`, of a POST whose answer is lines; their body is not returned.
 
         :param token: a freshness token of the other relay, or empty
         :param on_line: gets each line as soon as it has come
+        :param watch_seconds: as :data:`WATCH_SECONDS`
         """
 
         def read(response: Any) -> Deferred[bytes]:
             return _AnswerLines(on_line).read(response) if response.code == OK else readBody(response)
 
-        return await self._ask("POST", path, body, relay, client, read, token)
+        return await self._ask("POST", path, body, relay, client, read, token, watch_seconds)
 
     async def _ask(
         self,
@@ -337,6 +341,7 @@ class Forwarder:
         client: ForwardedClient,
         read: Callable[[Any], Deferred[bytes]],
         token: str = "",
+        watch_seconds: float = WATCH_SECONDS,
     ) -> RelayAnswer:
         check_compatible(relay)
         fields = Headers({"Content-Type": ["application/json"]})
@@ -348,21 +353,23 @@ class Forwarder:
         try:
             producer = FileBodyProducer(BytesIO(body)) if body else None
             sending = self._agent.request(method.encode(), url, fields, producer)
-            response = await self._while_it_answers(relay, sending)
+            response = await self._while_it_answers(relay, sending, watch_seconds)
             made = response.headers.getRawHeaders(FRESHNESS, [""])[0]
-            return RelayAnswer(response.code, await self._while_it_answers(relay, read(response)), made)
+            text = await self._while_it_answers(relay, read(response), watch_seconds)
+            return RelayAnswer(response.code, text, made)
         except (ConnectError, DNSLookupError, TimeoutError):
             raise unreachable(relay) from None
         except (RequestTransmissionFailed, ResponseFailed, PartialDownloadError):
             raise lost(relay) from None
 
-    async def _while_it_answers(self, relay: RelayInfo, waiting: Deferred[T]) -> T:
+    async def _while_it_answers(self, relay: RelayInfo, waiting: Deferred[T], watch_seconds: float) -> T:
         """Wait for another relay, whose time limits are not known here, for as long as it answers anything at all.
 
+        :param watch_seconds: as :data:`WATCH_SECONDS`
         :raises Unavailable: it stands still
         """
         silent = False
-        watching: Deferred[None] = Deferred.fromCoroutine(self._watch(relay))
+        watching: Deferred[None] = Deferred.fromCoroutine(self._watch(relay, watch_seconds))
 
         def end(_: Any) -> None:
             nonlocal silent
@@ -379,18 +386,18 @@ class Forwarder:
         finally:
             watching.cancel()
 
-    async def _watch(self, relay: RelayInfo) -> None:
+    async def _watch(self, relay: RelayInfo, seconds: float) -> None:
         """Return when a relay does not answer a short request in time."""
         answers = True
         while answers:
-            await sleep(self._reactor, WATCH_SECONDS)
-            answers = await self.answers(relay)
+            await sleep(self._reactor, seconds)
+            answers = await self.answers(relay, seconds)
 
-    async def answers(self, relay: RelayInfo) -> bool:
-        """Whether a relay answers a short request within :data:`WATCH_SECONDS`."""
+    async def answers(self, relay: RelayInfo, seconds: float = WATCH_SECONDS) -> bool:
+        """Whether a relay answers a short request in time."""
         fields = Headers({CLUSTER_HEADER: [self._settings.secret]})
         asking = self._agent.request(b"GET", f"http://{relay.address}{ANYTHING}".encode(), fields)
-        asking.addTimeout(WATCH_SECONDS, self._reactor)
+        asking.addTimeout(seconds, self._reactor)
         try:
             await readBody(await asking)
         except CancelledError:
@@ -429,12 +436,14 @@ class Forwarder:
         seconds: float | None = None,
         *,
         found_only: bool = False,
+        watch_seconds: float = WATCH_SECONDS,
     ) -> bool:
         """Pass a request on, and its answer back as it comes.
 
         :param body: of the request
         :param seconds: in which the head of the answer must come; ``None``: the request has its own limit
         :param found_only: do not pass the answer back if it is 404
+        :param watch_seconds: as :data:`WATCH_SECONDS`
         :returns: whether the answer was passed back
         :raises Unavailable: the other relay can't be reached, is of another version, or does not answer in time
         """
@@ -451,7 +460,7 @@ class Forwarder:
         if seconds is not None:
             sending.addTimeout(seconds, self._reactor)
         try:
-            response = await self._while_it_answers(relay, sending)
+            response = await self._while_it_answers(relay, sending, watch_seconds)
         except (ConnectError, DNSLookupError, TimeoutError):
             raise unreachable(relay) from None
         except (RequestTransmissionFailed, ResponseFailed):

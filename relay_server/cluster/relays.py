@@ -16,12 +16,12 @@ from relay_server.cluster.bus import BusLease, ClusterBus, LeaseUnavailable
 
 LEASES = "relays"
 READ_SECONDS = 2.0
+"""Seconds between reads of all leases."""
 CLUSTER_PROTOCOL = 1
 """Version of what relays say to each other: notices, questions, headers of forwarded requests. A change that relays of
 the version before can't work with raises it; :data:`OLDEST_PROTOCOL` follows one release later."""
 OLDEST_PROTOCOL = 1
 """Lowest version that this relay can work with, so that relays can be upgraded one after another."""
-"""Seconds between reads of all leases."""
 
 
 class RelayInfo(msgspec.Struct, frozen=True):

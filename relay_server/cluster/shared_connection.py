@@ -62,6 +62,14 @@ READ_SECONDS = 20.0
 MOST_UNREAD_BYTES = 64 * MIB
 """The same, after which the stream ends: the other relay did not pause it. One message may be large."""
 
+PING_SECONDS = 2.0
+"""Seconds between pings of the relay that has connected."""
+
+MOST_UNANSWERED = 5
+"""Pings after which no byte came, and the connection is given up. A relay that stood still itself sends only one for
+that time, and none while its own bytes are not taken: the kernel detects that
+(:func:`~relay_server.common.tcp.enable_tcp_keepalive`)."""
+
 APART_SECONDS = 0.0005
 """Small pieces this far apart are written at once, and not at the end of the turn."""
 
@@ -86,6 +94,10 @@ class FrameKind(IntEnum):
     """The sender has closed it, behind its bytes."""
     ABORT = 6
     """The sender has dropped it; what waits to be read is of no use."""
+    PING = 7
+    """The sender, which has connected, wants to know whether the other relay is there; of no stream."""
+    PONG = 8
+    """The answer."""
 
 
 class _HeldFrame:
@@ -300,6 +312,8 @@ class SharedConnection(TwistedProtocol):
         """Those that the other relay has ended, and whose last bytes are not read yet."""
         self._opened = 0
         self._rest = b""
+        self._unanswered = 0
+        self._ping_timer: Timer | None = None
         self._numbers: tuple[int, ...] = ()
         self._left = 0
         """Bytes that are left of a frame for :attr:`_numbers`."""
@@ -319,6 +333,18 @@ class SharedConnection(TwistedProtocol):
             tcp.bufferSize = BUFFER_BYTES
         self._writer = writer_for(self.transport, self._flushes)
         self.transport.registerProducer(PushProducer(self), True)
+        if self._accept is None:
+            self._ping_timer = self.clock.callLater(PING_SECONDS, self._ping)
+
+    def _ping(self) -> None:
+        if self._unanswered >= MOST_UNANSWERED:
+            self.log.warn("another relay is silent; its connection is given up", limited="silent relay")
+            self.transport.abortConnection()
+            return
+        if not self.full:
+            self._unanswered += 1
+            self.send_control(FrameKind.PING, 0)
+        self._ping_timer = self.clock.callLater(PING_SECONDS, self._ping)
 
     def close(self) -> None:
         """Close the connection behind what was written."""
@@ -329,6 +355,7 @@ class SharedConnection(TwistedProtocol):
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """All streams are over."""
+        cancel(self._ping_timer)
         streams, self._streams = [*self._streams.values(), *self._ending], {}
         self._lost = True
         self._clear()
@@ -440,6 +467,7 @@ class SharedConnection(TwistedProtocol):
 
     def dataReceived(self, data: bytes) -> None:
         """Pass on the bytes of streams as they come."""
+        self._unanswered = 0
         if self._rest:
             data, self._rest = self._rest + data, b""
         at, size = 0, len(data)
@@ -480,6 +508,9 @@ class SharedConnection(TwistedProtocol):
     def _control(self, kind: int, number: int) -> None:
         if kind == FrameKind.OPEN:
             self._open_accepted(number)
+            return
+        if kind == FrameKind.PING:
+            self.send_control(FrameKind.PONG, 0)
             return
         stream = self._streams.get(number)
         if stream is None:

@@ -23,7 +23,13 @@ from werkzeug.routing import Map, MapAdapter, Rule
 
 from relay_protocol import json_cost, jsontext, limits, nonfinite
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
-from relay_server.cluster.forwarding import FORWARDED_SECONDS, ForwardedClient, RequestForwarding
+from relay_server.cluster.forwarding import (
+    FORWARDED_SECONDS,
+    STOP_WATCH_SECONDS,
+    WATCH_SECONDS,
+    ForwardedClient,
+    RequestForwarding,
+)
 from relay_server.common.concurrency import detached
 from relay_server.common.etags import tag_of, weak
 from relay_server.common.freshness_tokens import HEADER as FRESHNESS
@@ -273,8 +279,12 @@ class Router(Resource):
         request.extend_time_limit(FORWARDED_SECONDS)
         client = ForwardedClient.of(request.principal, request.address)
         seconds = STOP_SECONDS if urgent else None
+        watch_seconds = STOP_WATCH_SECONDS if options.stored_if_unreachable else WATCH_SECONDS
+        forwarder = forwarding.forwarder
         try:
-            await forwarding.forwarder.forward(request.http, request.content(), relay, client, seconds)
+            await forwarder.forward(
+                request.http, request.content(), relay, client, seconds, watch_seconds=watch_seconds
+            )
         except Unavailable:
             if not options.stored_if_unreachable or request.http.startedWriting:
                 raise

@@ -23,6 +23,7 @@ from relay_server.cli.admin_socket_client import send_order
 from relay_server.cli.app import os_user
 from relay_server.cluster.forwarding import ANYTHING
 from relay_server.icpi.messages import IcpiMessage, parse, write
+from tests.worlds.chaos_proxy import ChaosProxy
 from tests.worlds.nats_servers import NatsServer, nats_server
 from tests.worlds.postgresql_server import postgresql_database
 from tests.worlds.processes import running
@@ -66,6 +67,7 @@ def postgres() -> Iterator[str]:
 class Fleet:
     """Two relays, a robot, and its user ann.
 
+    :ivar link: from the second relay to the first
     :ivar token: of ann
     """
 
@@ -74,7 +76,12 @@ class Fleet:
         secret = folder / "secret"
         secret.write_text(SECRET + "\n")
         options = ["--cluster-bus", bus.url, "--cluster-secret", str(secret), "--name", NAME]
-        self.relays = [Relay(folder / name, *options, database=database) for name in ("one", "two")]
+        self.link = ChaosProxy(0, host="127.0.0.2")
+        proxied = ["--cluster-listen", f"127.0.0.1:{self.link.port}", "--cluster-host", "127.0.0.2"]
+        self.relays = [
+            Relay(folder / name, *options, *more, database=database)
+            for name, more in (("one", proxied), ("two", []))
+        ]
         self.first, self.second = self.relays
         self.robot = SmallRobot(self.first, "rover", {"/say": say, "/drive": say}, moving=("/drive",))
         self.robot.picture = PICTURE
@@ -139,6 +146,7 @@ def fleet(postgres: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[F
         fleet = Fleet(folder, bus, postgres)
         for relay in fleet.relays:
             stack.enter_context(running(relay))
+        stack.callback(fleet.link.close)
         fleet.connect_at(fleet.first, fleet.second)
         yield fleet
         fleet.robot.goes()
@@ -502,8 +510,8 @@ def test_each_relay_shows_all_relays(fleet: Fleet) -> None:
 
 
 def test_the_port_for_relays_serves_only_relays(fleet: Fleet) -> None:
-    assert "the bus is connected" in fleet.first.log
-    port = int(fleet.first.log.rpartition("other relays connect at 127.0.0.1:")[2].split()[0])
+    assert "the bus is connected" in fleet.second.log
+    port = int(fleet.second.log.rpartition("other relays connect at 127.0.0.1:")[2].split()[0])
     # Other relays ask this whether it still answers anything.
     alive = httpx.get(f"http://127.0.0.1:{port}{ANYTHING}", headers={"Switchboard-Cluster": SECRET})
     assert alive.status_code < 500, alive.text
@@ -577,8 +585,6 @@ def test_a_home_that_stands_still_lets_no_request_wait(fleet: Fleet) -> None:
         assert client.call("/say")["result"]
         fleet.first.freeze()
         try:
-            answer = fleet.get(fleet.second, "/params")
-            assert (answer.status_code, "relay" in answer.json()["detail"]) == (503, True), answer.text
             fleet.connect_at(fleet.second)
             with pytest.raises(ConnectionClosed) as closed:
                 while True:
@@ -591,6 +597,38 @@ def test_a_home_that_stands_still_lets_no_request_wait(fleet: Fleet) -> None:
         finally:
             fleet.first.thaw()
     fleet.connect_at(fleet.first, fleet.second)
+    fleet.first.freeze()
+    try:
+        answer = fleet.get(fleet.second, "/params")
+        assert (answer.status_code, "relay" in answer.json()["detail"]) == (503, True), answer.text
+    finally:
+        fleet.first.thaw()
+
+
+def test_a_silent_network_between_relays_lets_no_stop_wait(fleet: Fleet) -> None:
+    """The stop passes by the database, and the client is told that its robot can't be reached."""
+    with fleet.second.connect("rover", fleet.token) as client:
+        assert client.call("/say")["result"]
+        fleet.link.black_hole()
+        try:
+            assert fleet.request("POST", fleet.second, "/stop", json={"reason": "test"}).status_code == 202
+            wait_for("the robot has stopped", lambda: fleet.robot.stopped is not None)
+            assert fleet.get(fleet.first, "").json()["stopped"]
+            with pytest.raises(ConnectionClosed) as closed:
+                while True:
+                    client.receive()
+            assert closed.value.rcvd is not None
+            assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (
+                4503,
+                "the connection to the robot's relay is lost; connect again",
+            )
+            with pytest.raises(InvalidStatus, match="503"):
+                fleet.second.connect("rover", fleet.token)
+        finally:
+            fleet.link.heal()
+    fleet.resume(fleet.second)
+    with fleet.second.connect("rover", fleet.token) as client:
+        assert client.call("/say")["result"]
 
 
 def test_death_of_the_home_relay_is_explained(fleet: Fleet) -> None:

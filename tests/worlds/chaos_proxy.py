@@ -44,23 +44,33 @@ class _Line:
                 self.bytes += len(packet)
 
 
+def _twin_server(host: str) -> socket.socket:
+    """A server whose port is free at 127.0.0.1 too."""
+    while True:
+        server = socket.create_server((host, 0))
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", server.getsockname()[1])):
+            return server
+        server.close()
+
+
 class ChaosProxy:
     """A TCP proxy on loopback that can drop bytes, limit the rate in either direction, add a delay, or reset
     everything.
 
-    :param target: its target port
+    :param target: its target port; 0: the same port of 127.0.0.1 as its own, which is free
     :param buffer: approximate bytes that its kernel takes from the target before they are passed on;
         unlimited by default. A network without a proxy acknowledges nothing that the client has not received.
+    :param host: its own address
     """
 
-    def __init__(self, target: int, buffer: int | None = None) -> None:
+    def __init__(self, target: int, buffer: int | None = None, host: str = "127.0.0.1") -> None:
         self._buffer = buffer
         self._up, self._down = _Line(), _Line()
-        self._target = target
         self.seconds_away = 0.0
         """By so much later what comes leaves, each way."""
-        self._server = socket.create_server(("127.0.0.1", 0))
+        self._server = socket.create_server((host, 0)) if target else _twin_server(host)
         self.port = int(self._server.getsockname()[1])
+        self._target = target or self.port
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
         self.forward_up = threading.Event()

@@ -43,7 +43,7 @@ class Fleet:
 
     async def ask_lines(self, *arguments: Any) -> RelayAnswer:
         """Executes the order, as far as a test has said."""
-        *asked, on_line = arguments
+        *asked, on_line, _ = arguments
         self.asked.append(tuple(asked))
         self.on_line = on_line
         for line in self.lines:

@@ -15,7 +15,9 @@ from relay_server.cluster.shared_connection import (
     ACCEPTED,
     JOINED_BYTES,
     MOST_NUMBERS,
+    MOST_UNANSWERED,
     MOST_UNREAD_BYTES,
+    PING_SECONDS,
     READ_SECONDS,
     UNREAD_BYTES,
     SharedConnection,
@@ -23,6 +25,9 @@ from relay_server.cluster.shared_connection import (
     StreamTransport,
 )
 from relay_server.common.socket_writer import FlushScheduler
+
+SINGLE_BYTES = 11
+"""Bytes of a frame for one stream, without data."""
 
 
 class Peer(Protocol):
@@ -374,6 +379,38 @@ def test_a_relay_accepts_the_connection_or_not(answer: bytes, status: int) -> No
     request.connectionLost()
     assert statuses == ([status] if status == 101 else [status, 0])
     assert lost == ([True] if status == 101 else [])
+
+
+def test_a_relay_that_is_silent_is_given_up() -> None:
+    pair = Pair()
+    mine, _ = pair.opened()
+    for _ in range(3 * MOST_UNANSWERED):
+        pair.clock.advance(PING_SECONDS)
+        pair.moves()
+    assert pair.bytes_down == 3 * MOST_UNANSWERED * SINGLE_BYTES
+    for _ in range(MOST_UNANSWERED):
+        pair.clock.advance(PING_SECONDS)
+    # Any byte counts, and a late answer too.
+    pair.moves()
+    for _ in range(MOST_UNANSWERED):
+        assert not pair.wires[0].disconnected
+        pair.clock.advance(PING_SECONDS)
+    pair.clock.advance(PING_SECONDS)
+    assert pair.wires[0].disconnected
+    assert not pair.wires[1].disconnected
+    pair.door.connectionLost()
+    assert mine.lost == 1
+    assert not pair.clock.getDelayedCalls()
+
+
+def test_what_a_relay_does_not_take_is_left_to_the_kernel() -> None:
+    """Its answer would be as late as the bytes before the ping."""
+    pair = Pair()
+    pair.opened()
+    pair.wires[0].producer.pauseProducing()
+    for _ in range(3 * MOST_UNANSWERED):
+        pair.clock.advance(PING_SECONDS)
+        assert not pair.wires[0].disconnected
 
 
 def test_a_stream_is_a_transport() -> None:
