@@ -15,6 +15,7 @@ from relay_server.cluster.element_commands import ClusterElements, NoElementForw
 from relay_server.cluster.fleet_orders import ClusterOrders, NoOrderForwarding, OrderForwarding
 from relay_server.config import RelaySettings
 from relay_server.control.gateway import ControlGateway
+from relay_server.control.lease import LeaseState
 from relay_server.control.service import ControlService
 from relay_server.core import Core, build_core
 from relay_server.events.service import EventLog
@@ -22,6 +23,7 @@ from relay_server.files.service import FileService
 from relay_server.fleet.service import FleetService
 from relay_server.foxglove_urls.service import FoxgloveUrlService
 from relay_server.icpi.programs import ProgramRegistry
+from relay_server.in_process_sessions.in_process_port import InProcessPort
 from relay_server.in_process_sessions.pool import InProcessSessionPool
 from relay_server.listeners import Listeners
 from relay_server.maintenance import ChangePolling, ChangeWatcher, Purge, RealmCaches
@@ -43,6 +45,7 @@ from relay_server.resources.goals import GoalService
 from relay_server.resources.representations import ConversionPool
 from relay_server.resources.service import RobotResourceService
 from relay_server.robots.link_handlers import report_key_used_twice
+from relay_server.robots.registry import RobotState
 from relay_server.roles.commands import RoleCommands
 from relay_server.roles.process import RoleProcess
 from relay_server.roles.runs import RoleRuns
@@ -112,7 +115,7 @@ def build_services(reactor: Any, settings: RelaySettings) -> Services:
     sessions = _sessions(core, control, modules)
     in_process_sessions = InProcessSessionPool(reactor, sessions)
     functions = _functions(core, sessions)
-    _join_cluster(core, sessions, changes, functions)
+    _join_cluster(core, sessions, changes, functions, recorder)
     conversions = ConversionPool(reactor)
     resources = RobotResourceService(reactor, in_process_sessions, conversions, now_ns, time.time)
     programs = ProgramRegistry()
@@ -156,7 +159,11 @@ def build_services(reactor: Any, settings: RelaySettings) -> Services:
 
 
 def _join_cluster(
-    core: Core, sessions: SessionManager, changes: ChangeWatcher, functions: FunctionService
+    core: Core,
+    sessions: SessionManager,
+    changes: ChangeWatcher,
+    functions: FunctionService,
+    recorder: Recordings,
 ) -> None:
     """Give the cluster what it needs of the services; nothing if this is the only relay."""
     cluster = core.cluster
@@ -169,6 +176,15 @@ def _join_cluster(
     cluster.clients = lambda: sum(1 for _ in sessions)
     cluster.lag = lambda: core.access.lag
     cluster.take_over = functions.take_over
+
+    def stays(robot: RobotState) -> bool:
+        # Pipes, Roles, goals and the like have sessions in this process.
+        clients = sessions.clients_of(robot.robot_id)
+        driven = core.controllers.of(robot).lease.state is not LeaseState.FREE
+        in_use = any(isinstance(each.port, InProcessPort) for each in clients)
+        return driven or in_use or recorder.records(robot.robot_id)
+
+    cluster.overload.stays = stays
 
 
 def _files(core: Core, sessions: SessionManager) -> FileService:

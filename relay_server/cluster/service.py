@@ -20,6 +20,7 @@ from relay_server.cluster.forwarding import Forwarder
 from relay_server.cluster.homes import ClusterHomes
 from relay_server.cluster.leadership import Leadership
 from relay_server.cluster.nats_bus import NatsBus
+from relay_server.cluster.overload import OverloadRelief
 from relay_server.cluster.relays import (
     CLUSTER_PROTOCOL,
     OLDEST_PROTOCOL,
@@ -80,6 +81,9 @@ class Cluster:
         self.notices = ChangeNotices(self.bus)
         self.file_notices = FileNotices(self.bus)
         self.status = ClusterStatus(self.bus, self.relays, self.homes, meter, self.id)
+        self.overload = OverloadRelief(
+            reactor, robots, lambda: 0.0 if self.drain.begun else meter.measure().cpu, self._loads_of_others
+        )
         self._port: Any = None
 
     def _own(self) -> RelayInfo:
@@ -120,14 +124,24 @@ class Cluster:
         """All other relays."""
         return [each for each in self.relays if each.id != self.id]
 
+    def _reachable(self) -> set[str]:
+        """The ids of relays that robots of this one can connect to. They can't choose between workers."""
+        group = self.settings.group
+        return {each.id for each in self.others() if not (group and each.group == group)}
+
     async def _has_others(self) -> bool:
         """Whether robots of this relay can connect to another one. Without the bus none can answer."""
         await self.relays.refresh(acquire=False)
-        group = self.settings.group
-        found = {each.id for each in self.others() if not (group and each.group == group)}
+        found = self._reachable()
         state = await self.status.read()
         taking = ("ready",) if state.bus else ("ready", "silent")
         return any(each.id in found and each.state in taking for each in state.relays)
+
+    async def _loads_of_others(self) -> list[float]:
+        """The shares of a core that the relays use to which robots of this one can connect."""
+        found, state = self._reachable(), await self.status.read()
+        ready = [each for each in state.relays if each.id in found and each.state == "ready"]
+        return [each.load.cpu for each in ready if each.load is not None]
 
     async def start(self, site: Any, tls: Any) -> None:
         """Listen for the other relays, and join them.
@@ -151,9 +165,11 @@ class Cluster:
         self.notices.start()
         self.file_notices.start()
         await self.leadership.start()
+        self.overload.start()
 
     async def stop(self) -> None:
         """Leave the cluster."""
+        self.overload.stop()
         if self._taking_over is not None:
             self._taking_over.cancel()
         self.notices.stop()

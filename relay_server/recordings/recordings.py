@@ -265,6 +265,10 @@ class Recordings:
             running.stop(reason)
         return done
 
+    def records(self, robot_id: int) -> bool:
+        """Whether a recording of a robot runs."""
+        return any(each.entry.robot_id == robot_id for each in self._running.values())
+
     def updated(self, entry: RecordingEntry) -> RecordingEntry:
         """A recording with current numbers."""
         running = self._running.get(entry.id)
