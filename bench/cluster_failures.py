@@ -316,7 +316,7 @@ def _own_postgres() -> list[psutil.Process]:
     found = []
     for each in psutil.process_iter(["name", "cmdline"]):
         if each.info["name"] == "postgres" and any(
-            "bench-postgresql-" in word for word in each.info["cmdline"]
+            "bench-postgresql-" in word for word in each.info["cmdline"] or ()
         ):
             found += [each, *each.children(recursive=True)]
     return found

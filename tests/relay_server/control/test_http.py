@@ -206,7 +206,7 @@ class UnreachableHome:
         """The other relay."""
         return self
 
-    async def forward(self, *arguments: Any) -> None:
+    async def forward(self, *arguments: Any, **options: Any) -> None:
         """Fails."""
         raise Unavailable("the robot's relay can't be reached")
 
