@@ -379,7 +379,8 @@ class Forwarder:
         watching.addCallbacks(end, lambda failure: failure.trap(CancelledError))
         try:
             return await waiting
-        except (CancelledError, ResponseFailed, PartialDownloadError):
+        except Exception:
+            # Also of a connection that was not established yet, which has an error of its own when it is cancelled.
             if silent:
                 raise lost(relay) from None
             raise

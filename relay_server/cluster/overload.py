@@ -1,7 +1,7 @@
 """An overloaded relay of a cluster has some of its robots dial others, while those have room.
 
 Robots that people or programs depend on at this moment stay: see :attr:`OverloadRelief.stays`. A robot that comes back,
-because it has only one address, is not asked again.
+because it has only one address, is not asked again for an hour.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ OVERLOADED = 0.85
 """Share of a core that a relay which uses one core should not use for long."""
 MOST_CHECKS = 3
 """So many averages in a row must be over it, also after some robots were asked."""
+AGAIN_SECONDS = 3600.0
+"""Seconds in which a robot is not asked again."""
 ROOM = 0.5
 """Share of a core that another relay may use at most, to be counted on."""
 ASKED_SHARE = 0.05
@@ -50,8 +52,9 @@ class OverloadRelief:
         self._cpu = cpu
         self._others = others
         self._over = 0
-        self._asked: set[int] = set()
-        """Robots that were asked, by number. One that is here again has nowhere else to go."""
+        self._seconds = reactor.seconds
+        self._asked: dict[int, float] = {}
+        """When robots were asked, by number. One that is here again has nowhere else to go."""
         self._loop = LoopingCall(self._check)
         self._loop.clock = reactor
 
@@ -78,16 +81,21 @@ class OverloadRelief:
         if not room:
             self.log.warn("this relay is overloaded, and no other has room", limited="overload")
             return
+        now = self._seconds()
+        self._asked = {number: at for number, at in self._asked.items() if now - at < AGAIN_SECONDS}
         connected = [each for each in self._robots if each.control_link is not None]
         movable = [each for each in connected if each.robot_id not in self._asked and not self.stays(each)]
         # Those that are used make the load.
         movable.sort(key=lambda each: (-(each.users + len(each.viewers)), each.robot_id))
         chosen = movable[: max(1, int(ASKED_SHARE * len(connected)))]
         if not chosen:
-            self.log.warn("this relay is overloaded, and all its robots are in use", limited="overload")
+            self.log.warn(
+                "this relay is overloaded, and all its robots are in use or were asked before",
+                limited="overload",
+            )
             return
         for robot in chosen:
-            self._asked.add(robot.robot_id)
+            self._asked[robot.robot_id] = now
             if robot.control_link is not None:
                 robot.control_link.close(OVERLOAD)
         self.log.warn(

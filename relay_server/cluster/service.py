@@ -71,18 +71,23 @@ class Cluster:
         """Returns the number of sessions here."""
         self.lag: Callable[[], float] = lambda: 0.0
         """Returns the seconds since changes were read."""
-        meter = LoadMeter(
-            self.drain,
-            robots=lambda: sum(each.control_link is not None for each in robots),
-            clients=lambda: self.clients(),
-            forwarded=lambda: len(self.forwarder.websockets),
-            lag=lambda: self.lag(),
-        )
+
+        def meter() -> LoadMeter:
+            return LoadMeter(
+                self.drain,
+                robots=lambda: sum(each.control_link is not None for each in robots),
+                clients=lambda: self.clients(),
+                forwarded=lambda: len(self.forwarder.websockets),
+                lag=lambda: self.lag(),
+            )
+
         self.notices = ChangeNotices(self.bus)
         self.file_notices = FileNotices(self.bus)
-        self.status = ClusterStatus(self.bus, self.relays, self.homes, meter, self.id)
+        self.status = ClusterStatus(self.bus, self.relays, self.homes, meter(), self.id)
+        # Its averages are over its own seconds.
+        load = meter()
         self.overload = OverloadRelief(
-            reactor, robots, lambda: 0.0 if self.drain.begun else meter.measure().cpu, self._loads_of_others
+            reactor, robots, lambda: 0.0 if self.drain.begun else load.measure().cpu, self._loads_of_others
         )
         self._port: Any = None
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from twisted.web.resource import Resource
 
 from relay_protocol.errors import Unavailable
 from relay_server.access import Principal
-from relay_server.cluster.forwarding import ForwardedClient, Forwarder
+from relay_server.cluster.forwarding import STOP_WATCH_SECONDS, ForwardedClient, Forwarder
 from relay_server.cluster.relays import RelayInfo
 from relay_server.config import ClusterSettings, ListenAddress
 from relay_server.http.limits import RequestLimits, UncountedConnections
@@ -149,3 +151,23 @@ async def test_a_relay_that_does_not_accept_is_explained(tmp_path: Path) -> None
     await home.stop()
     with pytest.raises(Unavailable, match="does not answer"):
         await home.forwarder().open_stream(relay, Reader({}))
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_host_that_answers_no_connection_is_given_up_as_soon_as_it_is_noticed() -> None:
+    """Its queue of connections is full, so the kernel drops more. A stop is stored only after this very error."""
+    with ExitStack() as stack:
+        server = stack.enter_context(socket.socket())
+        server.bind(("127.0.0.1", 0))
+        server.listen(0)
+        for _ in range(3):
+            filling = stack.enter_context(socket.socket())
+            filling.setblocking(False)
+            filling.connect_ex(server.getsockname())
+        settings = ClusterSettings((), ListenAddress.parse("127.0.0.1:0"), "localhost", SECRET)
+        forwarder = Forwarder(reactor, settings)
+        relay = RelayInfo("two", "127.0.0.1", server.getsockname()[1], "1", 0.0)
+        asking = forwarder.ask_lines("/", b"", relay, CLIENT, "", lambda line: None, STOP_WATCH_SECONDS)
+        with pytest.raises(Unavailable, match="was lost"):
+            await asking
+        await forwarder.close()

@@ -8,7 +8,13 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import Unavailable
-from relay_server.cluster.overload import CHECK_SECONDS, MOST_CHECKS, OVERLOAD, OverloadRelief
+from relay_server.cluster.overload import (
+    AGAIN_SECONDS,
+    CHECK_SECONDS,
+    MOST_CHECKS,
+    OVERLOAD,
+    OverloadRelief,
+)
 from relay_server.robots.registry import RobotState
 
 
@@ -72,6 +78,12 @@ def test_a_robot_that_comes_back_is_not_asked_again(scene: Scene) -> None:
     assert scene.asked() == [7]
     scene.robots[6].control_link = scene.links[7]
     assert scene.asked() == [9]
+    scene.relief.stays = lambda robot: robot.robot_id != 7
+    assert scene.asked() == []
+    scene.cpu = 0.0
+    scene.clock.advance(AGAIN_SECONDS)
+    scene.cpu = 1.0
+    assert scene.asked() == [7]
 
 
 @pytest.mark.parametrize("others", [[], [0.6, 0.9]])
