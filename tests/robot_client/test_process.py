@@ -105,12 +105,15 @@ class Drive:
         return cmdline[cmdline.index("--node") + 1] in known[-1]
 
     def drive(self) -> int:
-        """Drives for half a second; returns when the last command arrived, nanoseconds."""
+        """Drives for half a second; returns when the last command arrived, nanoseconds.
+
+        A zero may have come after it, where the machine held up the commands.
+        """
         self._held_up = self._pulse.held_up()
         for _ in range(10):
             self.channel.command(5, GO)
             time.sleep(0.05)  # the driver's rate
-        return int(self.node.heard("/cmd_vel")[-1]["at"])
+        return max(int(each["at"]) for each in self.node.heard("/cmd_vel") if each["x"])
 
     def zero_after(self, since: int) -> float:
         """Waits for the first zero after a time; returns the delay in milliseconds, without the time for
