@@ -23,6 +23,7 @@ from enum import IntEnum
 from struct import Struct, pack, unpack_from
 from typing import Any
 
+from twisted.internet.defer import Deferred, succeed
 from twisted.internet.error import ConnectionDone
 from twisted.internet.interfaces import IConsumer, IPushProducer, ITransport
 from twisted.internet.protocol import Protocol as TwistedProtocol
@@ -95,9 +96,10 @@ class FrameKind(IntEnum):
     ABORT = 6
     """The sender has dropped it; what waits to be read is of no use."""
     PING = 7
-    """The sender, which has connected, wants to know whether the other relay is there; of no stream."""
+    """The sender, which has connected, wants to know whether the other relay is there. The number is of no stream, but
+    one that the answer repeats."""
     PONG = 8
-    """The answer."""
+    """The answer: all that came before the ping was read."""
 
 
 class _HeldFrame:
@@ -196,6 +198,10 @@ class StreamTransport:
     def unregisterProducer(self) -> None:
         """See ``IConsumer``."""
         self._producer = None
+
+    def confirm(self, seconds: float) -> Deferred[bool]:
+        """See :meth:`SharedConnection.confirm`."""
+        return self._shared.confirm(seconds)
 
     # --- IPushProducer ------------------------------------------------------------------------------------
 
@@ -314,6 +320,9 @@ class SharedConnection(TwistedProtocol):
         self._rest = b""
         self._unanswered = 0
         self._ping_timer: Timer | None = None
+        self._confirming: dict[int, tuple[Deferred[bool], Timer]] = {}
+        """Those that wait for the answer to a ping, by its number; and when they give up."""
+        self._confirmations = 0
         self._numbers: tuple[int, ...] = ()
         self._left = 0
         """Bytes that are left of a frame for :attr:`_numbers`."""
@@ -346,6 +355,26 @@ class SharedConnection(TwistedProtocol):
             self.send_control(FrameKind.PING, 0)
         self._ping_timer = self.clock.callLater(PING_SECONDS, self._ping)
 
+    def confirm(self, seconds: float) -> Deferred[bool]:
+        """Ask whether the other relay has read what was written before. For the side that has connected.
+
+        :returns: fires with false if that is not known within so many seconds
+        """
+        if self._lost:
+            return succeed(False)
+        self._confirmations += 1
+        number = self._confirmations
+        confirming: Deferred[bool] = Deferred()
+        self._confirming[number] = confirming, self.clock.callLater(seconds, self._confirm, number, False)
+        self.send_control(FrameKind.PING, number)
+        return confirming
+
+    def _confirm(self, number: int, read: bool) -> None:
+        if number in self._confirming:
+            confirming, timer = self._confirming.pop(number)
+            cancel(timer)
+            confirming.callback(read)
+
     def close(self) -> None:
         """Close the connection behind what was written."""
         self._flush()
@@ -360,6 +389,8 @@ class SharedConnection(TwistedProtocol):
         self._lost = True
         self._clear()
         self.on_lost()
+        for number in list(self._confirming):
+            self._confirm(number, False)
         for each in streams:
             each.lost()
 
@@ -510,7 +541,10 @@ class SharedConnection(TwistedProtocol):
             self._open_accepted(number)
             return
         if kind == FrameKind.PING:
-            self.send_control(FrameKind.PONG, 0)
+            self.send_control(FrameKind.PONG, number)
+            return
+        if kind == FrameKind.PONG:
+            self._confirm(number, True)
             return
         stream = self._streams.get(number)
         if stream is None:

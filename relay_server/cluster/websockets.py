@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, Protocol
@@ -132,6 +132,8 @@ class ForwardedWebSocket:
         self._paused_bytes: int | None = None
         """Bytes sent to the home since it takes none; ``None``: it takes bytes."""
         self._opening: Deferred[None] = Deferred()
+        self.on_message: Callable[[bytes, bool], object] = _ignore
+        """Called with each message that was forwarded, and whether it is binary."""
 
     async def open(self) -> None:
         """Open the websocket to the home.
@@ -159,10 +161,21 @@ class ForwardedWebSocket:
     def message(self, payload: bytes, *, earliest_sent: int | None = None) -> None:
         """Forward a text message."""
         self._send(masked(TEXT, payload))
+        self.on_message(payload, False)
 
     def binary_message(self, payload: bytes, *, earliest_sent: int) -> None:
         """Forward a binary message."""
         self._send(masked(BINARY, payload))
+        self.on_message(payload, True)
+
+    async def confirm(self, seconds: float) -> bool:
+        """Whether the home has read all messages within some seconds; false if it is not known."""
+        return self._home is not None and await self._home.transport.confirm(seconds)
+
+    def answer(self, frame: bytes) -> None:
+        """Send the client a frame of this relay, unless that would divide a message of the home."""
+        if not self._ended and self._home is not None and not self._home.inside_message:
+            self.frames(frame)
 
     def ping(self) -> None:
         """The home pings."""
@@ -417,3 +430,7 @@ class _HomeConnection(TwistedProtocol):
 
 def _nothing() -> None:
     """Nothing waits in the queue of a forwarded websocket."""
+
+
+def _ignore(payload: bytes, binary: bool) -> None:
+    """No message is looked at."""

@@ -161,7 +161,7 @@ class Advertisements(ABC):
         encode_withdrawal: Callable[[list[int]], bytes],
     ) -> None:
         self._context = context
-        self._numbers = itertools.count(1)
+        self._numbers = itertools.count(2)
         self._by_name: dict[str, Advertisement] = {}
         self._by_number: dict[int, Advertisement] = {}
         self._announcer = PacedAnnouncer(context, encode)
@@ -225,7 +225,7 @@ class Advertisements(ABC):
         elif not (type_name := next((each for each in types if known.knows(each)), "")):
             return False
         texts = self._texts(known, type_name, encoding)
-        advertised = Advertisement(next(self._numbers), name, type_name, encoding, _hash(texts), known)
+        advertised = Advertisement(self._number_of(name), name, type_name, encoding, _hash(texts), known)
         self._by_name[name] = self._by_number[advertised.number] = advertised
         self._announce(advertised, texts)
         return True
@@ -249,6 +249,9 @@ class Advertisements(ABC):
             self._withdrawn(each)
         if announced:
             self._context.send(self._encode_withdrawal(announced))
+
+    def _number_of(self, name: str) -> int:
+        return next(self._numbers)
 
     def _encoding_of(self, name: str) -> str:
         return "cdr" if "cdr" in self._context.client.robot.encodings else "json"

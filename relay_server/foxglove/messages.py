@@ -222,6 +222,11 @@ def time(time_ns: int) -> bytes:
     return websocket_frames.binary(_TIME.pack(2, time_ns))
 
 
+def call_head(service: int) -> bytes:
+    """The first bytes of a client's call of a service."""
+    return bytes([_SERVICE_CALL]) + _U32.pack(service)
+
+
 def service_response(service: int, call: int, encoding: str, body: bytes) -> bytes:
     """The frame of the answer to a service call."""
     name = encoding.encode()

@@ -19,6 +19,9 @@ from relay_server.relay_node import interfaces
 from relay_server.relay_node.visible_graph import visible_graph
 from relay_server.sessions.service_calls import OWN_BYTES, OWN_TOO_LARGE, STOP, is_stopping_call
 
+STOP_NUMBER = 1
+"""Number of the service that stops the robot, on every connection. No other service or channel has it."""
+
 CALLS = 32
 """Most calls of one client that wait for their answers, beside those that stop the robot."""
 
@@ -67,6 +70,9 @@ class FoxgloveServices(Advertisements):
             if service.types and not name.startswith(_LEFT_OUT):
                 found[name] = service.types
         return found
+
+    def _number_of(self, name: str) -> int:
+        return STOP_NUMBER if name == STOP else super()._number_of(name)
 
     def _encoding_of(self, name: str) -> str:
         return "cdr" if name in interfaces.OWN_SERVICES else super()._encoding_of(name)

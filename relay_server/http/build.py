@@ -250,6 +250,7 @@ def _root(
     )
     frames = VideoFactory(reactor, now_ns, auth, sessions, connections, timers, limits)
     clients.forwarding = frames.forwarding = forwarding
+    clients.stop = services.control_gateway.stop
     video = VideoResource(
         reactor,
         timers,

@@ -80,7 +80,7 @@ class ServiceCallHandler:
                 call_context(self._client, service, self._client.earliest_sent, raw),
             )
         else:
-            answer = self._call_local(local, _arguments(service, raw), is_stopping_call(operation))
+            answer = self._call_local(local, own_arguments(service, raw), is_stopping_call(operation))
         running = Deferred.fromCoroutine(self._finish(operation, answer))
         self._calls[running] = operation
         self._bytes += size
@@ -156,7 +156,7 @@ def is_stopping_call(operation: rosbridge.ClientOp) -> bool:
 _STOPPING_NAMES = {name.lstrip("/") for name in STOPPING_SERVICES}
 
 
-def _arguments(service: str, raw: bytes) -> Any:
+def own_arguments(service: str, raw: bytes) -> Any:
     """The arguments of a call to one of the relay's own services.
 
     :raises SwitchboardError: too many bytes, or no JSON; for a stop the arguments are empty instead

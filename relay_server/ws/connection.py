@@ -9,7 +9,8 @@ The subprotocol decides the dialect: a client that offers one of Foxglove's spea
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any, TypeVar, cast
 from urllib.parse import unquote
 
@@ -33,11 +34,13 @@ from relay_server.common.concurrency import with_timeout
 from relay_server.common.pacing import Pacer
 from relay_server.common.socket_writer import FlushScheduler
 from relay_server.common.tcp import keep_little, tcp_of
+from relay_server.control.service import StopResult
 from relay_server.foxglove import messages
 from relay_server.foxglove.options import NO_OPTIONS, stream_options
 from relay_server.http.limits import ConnectionLimits, RequestLimits, Slot, TooManyRequests
 from relay_server.sessions.manager import Admission
 from relay_server.ws.bounded import BoundedProtocol
+from relay_server.ws.forwarded_stops import ForwardedStops
 from relay_server.ws.handshake import (
     HANDSHAKE_STATUS,
     BinaryHandler,
@@ -339,6 +342,11 @@ class ClientConnection(BoundedProtocol):
         if forwarded is not None:
             self.factory.sessions.release(admission)
             self._binary_handler = forwarded
+            if self.has_dialects:
+                # Given as the client named it; the client may have left when it is called.
+                stop = partial(self._stop_here, admission.permit.principal, self._robot, self._address())
+                stops = ForwardedStops(forwarded, admission.robot.name, self._foxglove, stop)
+                forwarded.on_message = stops.message
         handler = self._handler = forwarded or self._open_handler(admission)
         # The session writes past Autobahn, without a check of its state; see stop_sending.
         handler.send_queue.write = self._writer.write
@@ -350,6 +358,12 @@ class ClientConnection(BoundedProtocol):
         early, self._early = self._early, []
         for message in early:
             handler.message(message)
+
+    async def _stop_here(
+        self, principal: Principal, robot: str, address: str, why: str, stop_id: str
+    ) -> StopResult:
+        """Stop a robot of another relay by way of this one."""
+        return await self.factory.stop(principal, robot, why, address, stop_id)
 
     async def _open_elsewhere(self, *, early: bool = False) -> None:
         """Connect to the robot's home if that is another relay.
@@ -615,6 +629,8 @@ class ClientFactory(WebSocketServerFactory):
     protocol = ClientConnection
     forwarding: RequestForwarding | None = None
     """``None``: this is the only relay."""
+    stop: Callable[..., Coroutine[Any, Any, StopResult]]
+    """See :meth:`~relay_server.control.gateway.ControlGateway.stop`."""
     takes_forwarded = True
     """Whether other relays may forward clients."""
     forwarded_client: ForwardedClient | None = None

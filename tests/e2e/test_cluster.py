@@ -605,13 +605,53 @@ def test_a_home_that_stands_still_lets_no_request_wait(fleet: Fleet) -> None:
         fleet.first.thaw()
 
 
+def services(foxglove: Any) -> list[dict[str, Any]]:
+    """The services that a Foxglove client gets first."""
+    while True:
+        message = foxglove.recv(PATIENCE)
+        if isinstance(message, str) and json.loads(message)["op"] == "advertiseServices":
+            return list(json.loads(message)["services"])
+
+
+def stops_and_resumes(fleet: Fleet) -> None:
+    """The robot stops, and the first relay resumes it."""
+    wait_for("the robot has stopped", lambda: fleet.robot.stopped is not None)
+    fleet.resume(fleet.first)
+    wait_for("the robot has resumed", lambda: fleet.robot.stopped is None)
+
+
 def test_a_silent_network_between_relays_lets_no_stop_wait(fleet: Fleet) -> None:
-    """The stop passes by the database, and the client is told that its robot can't be reached."""
-    with fleet.second.connect("rover", fleet.token) as client:
+    """The stop passes by the database, however it was sent, and the client learns that its robot can't be reached."""
+    address = f"ws://127.0.0.1:{fleet.second.http_port}/robots/rover"
+    headers, protocols = {"Authorization": f"Bearer {fleet.token}"}, [Subprotocol("foxglove.websocket.v1")]
+    with (
+        fleet.second.connect("rover", fleet.token) as client,
+        connect(address, additional_headers=headers, subprotocols=protocols) as foxglove,
+    ):
         assert client.call("/say")["result"]
+        stop = next(each for each in services(foxglove) if each["name"] == "/relay/stop")
         fleet.link.black_hole()
         try:
             assert fleet.request("POST", fleet.second, "/stop", json={"reason": "test"}).status_code == 202
+            stops_and_resumes(fleet)
+            answer = client.call("/relay/stop", {"why": "test", "stop_id": "one"})
+            assert (answer["result"], answer["values"]) == (
+                True,
+                {
+                    "success": True,
+                    "message": "robot rover will be stopped as soon as it can be reached",
+                    "done": False,
+                    "stopped": {**answer["values"]["stopped"], "why": "test", "confirmed": False},
+                },
+            )
+            stops_and_resumes(fleet)
+            foxglove.send(struct.pack("<BIII", 2, stop["id"], 5, 4) + b"json" + b'{"why":"test"}')
+            assert json.loads(foxglove.recv(PATIENCE)) == {
+                "op": "serviceCallFailure",
+                "serviceId": stop["id"],
+                "callId": 5,
+                "message": "robot rover will be stopped as soon as it can be reached",
+            }
             wait_for("the robot has stopped", lambda: fleet.robot.stopped is not None)
             assert fleet.get(fleet.first, "").json()["stopped"]
             with pytest.raises(ConnectionClosed) as closed:

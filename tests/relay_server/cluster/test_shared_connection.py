@@ -425,3 +425,25 @@ def test_a_stream_is_a_transport() -> None:
     transport.stopProducing()
     pair.moves()
     assert pair.accepted[0].came == b"ab"
+
+
+def test_what_the_other_relay_has_read_is_confirmed() -> None:
+    """Not before it has, not after the time, and not when the connection ends; each question has its own answer."""
+    pair = Pair()
+    mine, other = pair.opened()
+    confirmed: list[Any] = []
+    mine.transport.write(b"stop")
+    mine.transport.confirm(1.0).addCallback(lambda read: confirmed.append((read, other.came)))
+    pair.clock.advance(0.5)
+    mine.transport.write(b" again")
+    mine.transport.confirm(1.0).addCallback(lambda read: confirmed.append((read, other.came)))
+    pair.clock.advance(0.5)
+    assert confirmed == [(False, b"")]
+    pair.moves()
+    assert confirmed == [(False, b""), (True, b"stop again")]
+    mine.transport.confirm(1.0).addCallback(confirmed.append)
+    pair.door.connectionLost()
+    mine.transport.confirm(1.0).addCallback(confirmed.append)
+    assert confirmed[2:] == [False, False]
+    pair.clock.advance(0)
+    assert not pair.clock.getDelayedCalls()
