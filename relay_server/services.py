@@ -170,6 +170,8 @@ def _join_cluster(
     if cluster is None:
         return
     cluster.notices.apply = changes.apply
+    cluster.robot_facts.facts_of = sessions.overview.facts_of
+    sessions.overview.facts_elsewhere = cluster.robot_facts.find
     changes.on_applied = cluster.notices.applied
     cluster.homes.on_moved = sessions.robot_moved
     cluster.homes.on_key_used_twice = partial(report_key_used_twice, core.bus)

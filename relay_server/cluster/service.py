@@ -28,6 +28,7 @@ from relay_server.cluster.relays import (
     RelayInfo,
     check_compatible,
 )
+from relay_server.cluster.robot_facts import RobotFactsNotices
 from relay_server.cluster.status import ClusterStatus, LoadMeter
 from relay_server.common.database import AsyncDatabase
 from relay_server.config import ClusterSettings
@@ -83,6 +84,7 @@ class Cluster:
 
         self.notices = ChangeNotices(self.bus)
         self.file_notices = FileNotices(self.bus)
+        self.robot_facts = RobotFactsNotices(reactor, self.bus, robots, self.homes, self.id)
         self.status = ClusterStatus(self.bus, self.relays, self.homes, meter(), self.id)
         # Its averages are over its own seconds.
         load = meter()
@@ -105,6 +107,7 @@ class Cluster:
 
     def _relays_changed(self) -> None:
         self.homes.relays_changed()
+        self.robot_facts.send_all()
         self._departed.note(self.others())
         if self._taking_over is None:
             self._taking_over = self._reactor.callLater(GONE_SECONDS, self._take_over)
@@ -169,6 +172,7 @@ class Cluster:
         self.status.start()
         self.notices.start()
         self.file_notices.start()
+        self.robot_facts.start()
         await self.leadership.start()
         self.overload.start()
 
@@ -179,6 +183,7 @@ class Cluster:
             self._taking_over.cancel()
         self.notices.stop()
         self.file_notices.stop()
+        self.robot_facts.stop()
         try:
             await self.leadership.stop()
             self.status.stop()

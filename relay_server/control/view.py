@@ -278,23 +278,27 @@ def stopped(snapshot: ControlSnapshot) -> StopInfo | None:
     }
 
 
-def overrides(robot: RobotState, rules: Rules | None = None) -> Overrides:
-    """Suppressed and inhibited topics of a robot, with the users that did so.
-
-    :param rules: of the client, to leave out topics that it may not use; ``None``: include all
-    """
-    reader = None if rules is None else ControlReader(rules, lambda client: False)
+def overrides(robot: RobotState) -> Overrides:
+    """Suppressed and inhibited topics of a robot, with the users that did so."""
 
     def shown(facts: Iterable[Suppressed | Inhibited]) -> list[OverrideInfo]:
         return [
             {"resource": each.resource, "by": each.by, "hold": isinstance(each, Inhibited) and each.hold}
             for each in facts
-            if reader is None or reader.may_know(each.resource)
         ]
 
     return {
         "suppressed": shown(robot.motion_state.suppressed),
         "inhibited": shown(robot.motion_state.inhibited),
+    }
+
+
+def visible_overrides(found: Overrides, rules: Rules) -> Overrides:
+    """Those without topics that a reader with these rights may not use."""
+    reader = ControlReader(rules, lambda client: False)
+    return {
+        "suppressed": [each for each in found["suppressed"] if reader.may_know(each["resource"])],
+        "inhibited": [each for each in found["inhibited"] if reader.may_know(each["resource"])],
     }
 
 

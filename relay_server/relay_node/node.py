@@ -16,7 +16,7 @@ from relay_server.modules.service import ModuleService
 from relay_server.relay_node import control, modules, rosapi
 from relay_server.robots.link_quality import joined, milliseconds
 from relay_server.sessions.context import ClientContext, StartOwnGoal
-from relay_server.sessions.presence import PresenceReader, PresenceService, client_rows
+from relay_server.sessions.presence import PresenceReader, PresenceService, client_rows, visible_clients
 from relay_server.sessions.rosbridge_port import slow_connection_advice
 from relay_server.video.stream import CameraStream
 from relay_server.video.streams import CameraStreams
@@ -102,7 +102,7 @@ class RelayNode:
             "robot": robot.name,
             "state": robot.state.value,
             "level": str(rules.level or ""),
-            "clients": client_rows(robot, self._clients(robot.robot_id), rules),
+            "clients": visible_clients(client_rows(robot, self._clients(robot.robot_id)), rules),
             "rtt_ms": {"client_relay": milliseconds(client.rtt), "relay_robot": milliseconds(robot.rtt)},
             "links": {
                 "client_relay": near.summary(),
@@ -144,7 +144,7 @@ class RelayNode:
                 "state": view.state(standing),
                 "holder": view.holder(standing) or "",
                 "you": standing.lease.held_by(client),
-                **view.overrides(robot, client.permit.rules),
+                **view.visible_overrides(view.overrides(robot), rules),
             },
             "stopped": standing.stopped is not None,
         }

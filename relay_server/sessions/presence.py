@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, Protocol, TypedDict
 from relay_protocol.rights import Level, Operation, Rules
 from relay_server.control.view import OverrideInfo, StopInfo
 from relay_server.robots.link_quality import LinkQuality, LinkQualityInfo, Quality, joined, milliseconds
-from relay_server.robots.registry import RobotState, ViewerInfo
+from relay_server.robots.registry import RobotState
 
 AvailabilityName = Literal["offline", "online", "in_use"]
 
@@ -28,23 +28,11 @@ class ClientInfo(TypedDict):
     camera: str
 
 
-class RobotInfo(TypedDict):
-    """A robot.
+class RobotFacts(TypedDict):
+    """What is known of a robot, whoever asks; see :class:`RobotInfo`."""
 
-    :param level: level of the caller's rights
-    :param people: number of its users and viewers
-    :param holder: the user who has control of it
-    :param battery: charge, 0 to 1
-    :param rtt_ms: round trip to it, milliseconds
-    :param last_seen: Unix seconds
-    """
-
-    name: str
-    description: str
     state: AvailabilityName
-    level: Level
     clients: list[ClientInfo]
-    people: int
     holder: str | None
     stopped: StopInfo | None
     suppressed: list[OverrideInfo]
@@ -56,6 +44,23 @@ class RobotInfo(TypedDict):
     platform: str
     distro: str
     last_seen: float | None
+
+
+class RobotInfo(RobotFacts):
+    """A robot, as far as the caller may know of it.
+
+    :param level: level of the caller's rights
+    :param people: number of its users and viewers
+    :param holder: the user who has control of it
+    :param battery: charge, 0 to 1
+    :param rtt_ms: round trip to it, milliseconds
+    :param last_seen: Unix seconds
+    """
+
+    name: str
+    description: str
+    level: Level
+    people: int
 
 
 class RobotPage(TypedDict):
@@ -136,15 +141,16 @@ CACHE_SECONDS = 0.5
 """Seconds for which a summary of connections is reused: each reader asks once a second."""
 
 
-def client_rows(robot: RobotState, sessions: Iterable[ConnectedClient], rules: Rules) -> list[ClientInfo]:
-    """The clients of a robot, and the viewers of those cameras that a reader with these rights may view."""
+def client_rows(robot: RobotState, sessions: Iterable[ConnectedClient]) -> list[ClientInfo]:
+    """The clients of a robot, and the viewers of its cameras."""
     found = [ClientInfo(user=each.name, since=each.since, camera="") for each in sessions]
-    found += [
-        ClientInfo(user=each.name, since=since, camera=each.camera)
-        for each, since in robot.viewers.items()
-        if _may_view(rules, each)
-    ]
-    return found
+    viewers = robot.viewers.items()
+    return found + [ClientInfo(user=each.name, since=since, camera=each.camera) for each, since in viewers]
+
+
+def visible_clients(clients: Iterable[ClientInfo], rules: Rules) -> list[ClientInfo]:
+    """The clients without the viewers of cameras that a reader with these rights may not view."""
+    return [each for each in clients if not each["camera"] or _may_view(rules, each["camera"])]
 
 
 class ConnectedClient(Protocol):
@@ -228,7 +234,7 @@ class PresenceService:
         people = dict(summary.people)
         if reader.user in people:
             people[reader.user] = _own_entry(people[reader.user], reader)
-        watched = [(each, at) for each, at in robot.viewers.items() if _may_view(reader.rules, each)]
+        watched = [(each, at) for each, at in robot.viewers.items() if _may_view(reader.rules, each.camera)]
         count = len(summary.numbers)
         room = max(0, MAX_LISTED - count)
         for viewer, since in watched[:room]:
@@ -239,11 +245,6 @@ class PresenceService:
             people[viewer.name] = {**entry, "watching": [*entry["watching"], view]}
         more = max(0, count - MAX_LISTED) + max(0, len(watched) - room)
         return (sorted(people.values(), key=_since) if watched else list(people.values())), more
-
-    def count(self, robot: RobotState, rules: Rules) -> int:
-        """Number of a robot's users and viewers, as far as a reader with these rights may know of them."""
-        users = {each.name for each in self._sessions(robot.robot_id)}
-        return len(users | {each.name for each in robot.viewers if _may_view(rules, each)})
 
     def _summary(self, robot: RobotState, owner: bool) -> ConnectionSummary:
         """The connections to a robot, summarised once for all readers within :data:`CACHE_SECONDS`."""
@@ -311,8 +312,8 @@ def _own_entry(entry: RobotUser, reader: PresenceReader) -> RobotUser:
     return {**entry, "you": True, "connections": connections}
 
 
-def _may_view(rules: Rules, viewer: ViewerInfo) -> bool:
-    return rules.decide(Operation.VIEW, viewer.camera).allowed
+def _may_view(rules: Rules, camera: str) -> bool:
+    return rules.decide(Operation.VIEW, camera).allowed
 
 
 def _since(entry: RobotUser) -> float:

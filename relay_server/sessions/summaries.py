@@ -17,7 +17,15 @@ from relay_server.control.controllers import Controllers
 from relay_server.robots.link_quality import LinkQuality, joined, milliseconds
 from relay_server.robots.registry import RobotRegistry, RobotState
 from relay_server.sessions.context import ClientContext
-from relay_server.sessions.presence import PresenceReader, PresenceService, RobotInfo, RobotUsers, client_rows
+from relay_server.sessions.presence import (
+    PresenceReader,
+    PresenceService,
+    RobotFacts,
+    RobotInfo,
+    RobotUsers,
+    client_rows,
+    visible_clients,
+)
 
 CACHE_SECONDS = 0.25
 """Most seconds that a page's summary is reused. Values such as round-trip times change without an event."""
@@ -45,6 +53,8 @@ class RobotSummaries:
         self._clients = clients
         self._controllers = controllers
         self._seconds = seconds
+        self.facts_elsewhere: Callable[[int], RobotFacts | None] = lambda robot_id: None
+        """Returns what another relay of the cluster knows of a robot, by its number."""
         self._views: dict[tuple[object, ...], tuple[float, RobotInfo]] = {}
         registry.on_change(self._views.clear)
 
@@ -101,21 +111,40 @@ class RobotSummaries:
         return RobotState(record.id, record.name, record.realm, elsewhere=elsewhere)
 
     def _summary(self, record: queries.RobotRecord, rules: Rules) -> RobotInfo:
-        robot = self._of(record)
-        link = robot.link_quality()
-        snapshot = self._controllers.snapshot(record.id)
         # Only robots with a right are listed.
         assert rules.level is not None
+        facts = self._facts(record)
+        clients = visible_clients(facts["clients"], rules)
         return {
             "name": record.name,
             "description": record.description,
-            "state": robot.state.value,
+            **facts,
             "level": rules.level,
-            "clients": client_rows(robot, self._clients(record.id), rules),
-            "people": self._presence.count(robot, rules),
+            "clients": clients,
+            "people": len({each["user"] for each in clients}),
+            **view.visible_overrides(facts, rules),
+        }
+
+    def _facts(self, record: queries.RobotRecord) -> RobotFacts:
+        """The facts of a robot, which its own relay knows."""
+        robot = self._of(record)
+        facts = self.facts_of(robot)
+        there = self.facts_elsewhere(robot.robot_id) if robot.elsewhere else None
+        if there is None:
+            return facts
+        # A stop may be on its way there.
+        return {**there, "stopped": there["stopped"] or facts["stopped"]}
+
+    def facts_of(self, robot: RobotState) -> RobotFacts:
+        """The facts of a robot, as far as this relay knows them itself."""
+        link = robot.link_quality()
+        snapshot = self._controllers.snapshot(robot.robot_id)
+        return {
+            "state": robot.state.value,
+            "clients": client_rows(robot, self._clients(robot.robot_id)),
             "holder": view.holder(snapshot),
             "stopped": view.stopped(snapshot),
-            **view.overrides(robot, rules),
+            **view.overrides(robot),
             "battery": _battery(robot),
             "rtt_ms": milliseconds(link.rtt),
             "quality": link.quality,

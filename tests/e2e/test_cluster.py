@@ -207,6 +207,31 @@ def test_foxglove_at_another_relay_reaches_the_robot(fleet: Fleet) -> None:
                 client.recv(timeout=PATIENCE)
 
 
+def test_lists_show_the_same_of_a_robot_at_each_relay(fleet: Fleet) -> None:
+    """Also who uses it, and that it is stopped."""
+    passing = {"rtt_ms", "last_seen"}
+
+    def shown(relay: Relay) -> dict[str, Any]:
+        return {name: value for name, value in fleet.listed(relay).items() if name not in passing}
+
+    with fleet.second.connect("rover", fleet.token) as client:
+        assert client.call("/relay/take_control")["values"]["success"]
+        assert client.call("/relay/stop", {"why": "test"})["values"]["done"]
+        here = shown(fleet.first)
+        assert (here["state"], here["holder"], here["people"], here["platform"]) == (
+            "in_use",
+            "ann",
+            1,
+            "json",
+        )
+        assert here["stopped"]["confirmed"]
+        wait_for("the second shows the same", lambda: shown(fleet.second) == here)
+    fleet.resume(fleet.second)
+    here = shown(fleet.first)
+    assert (here["state"], here["people"], here["stopped"]) == ("online", 0, None)
+    wait_for("the second shows the same", lambda: shown(fleet.second) == here)
+
+
 @pytest.mark.parametrize(("revoking", "serving"), [(0, 1), (1, 0), (1, 1)])
 def test_a_foxglove_url_revoked_at_one_relay_is_cut_at_another(
     fleet: Fleet, revoking: int, serving: int

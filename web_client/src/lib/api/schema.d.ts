@@ -8443,7 +8443,7 @@ export interface components {
         RobotGroupList: {
             groups: components["schemas"]["RobotGroupInfo"][];
         };
-        /** @description A robot. */
+        /** @description A robot, as far as the caller may know of it. */
         RobotInfo: {
             /** @description charge, 0 to 1 */
             battery: number | null;
