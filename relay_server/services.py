@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from relay_protocol.clocks import now_ns
+from relay_server.alerts.hub import AlertHub
 from relay_server.alerts.service import Alerts
 from relay_server.auth.service import AuthService
 from relay_server.auth.url_tokens import UrlTokens
@@ -115,7 +116,7 @@ def build_services(reactor: Any, settings: RelaySettings) -> Services:
     sessions = _sessions(core, control, modules)
     in_process_sessions = InProcessSessionPool(reactor, sessions)
     functions = _functions(core, sessions)
-    _join_cluster(core, sessions, changes, functions, recorder)
+    _join_cluster(core, sessions, changes, functions, recorder, alerts.hub)
     conversions = ConversionPool(reactor)
     resources = RobotResourceService(reactor, in_process_sessions, conversions, now_ns, time.time)
     programs = ProgramRegistry()
@@ -164,6 +165,7 @@ def _join_cluster(
     changes: ChangeWatcher,
     functions: FunctionService,
     recorder: Recordings,
+    alerts: AlertHub,
 ) -> None:
     """Give the cluster what it needs of the services; nothing if this is the only relay."""
     cluster = core.cluster
@@ -172,6 +174,8 @@ def _join_cluster(
     cluster.notices.apply = changes.apply
     cluster.robot_facts.facts_of = sessions.overview.facts_of
     sessions.overview.facts_elsewhere = cluster.robot_facts.find
+    cluster.alert_notices.take = alerts.mirror
+    alerts.on_written = cluster.alert_notices.written
     changes.on_applied = cluster.notices.applied
     cluster.homes.on_moved = sessions.robot_moved
     cluster.homes.on_key_used_twice = partial(report_key_used_twice, core.bus)

@@ -33,6 +33,9 @@ TOPICS_EVERY = 4
 SWEEP_EVERY = 40
 """Checks between two sweeps of the store, which also let pages show new counts and changes by quiet hours."""
 
+MIRROR_EVERY = 120
+"""Checks between two reads of the alerts of other relays, whose notices may be lost."""
+
 ABSENT_SECONDS = 30.0
 """Time for robots to come online after the relay has started."""
 
@@ -110,6 +113,8 @@ class AlertHub:
         self._controlled: set[int] = set()
         """Robots that were controlled through this relay, which sees a loss of control itself."""
         self._listeners: list[Callable[[str, AlertRecord], None]] = []
+        self.on_written: Callable[[Collection[AlertRecord]], object] | None = None
+        """Called with alerts that were written, for the other relays of a cluster; ``None``: there are none."""
         self._rights: dict[int, tuple[object, dict[int, Rules]]] = {}
         """The latest result of :meth:`Access.robots`, and the same by robot, for each user."""
         self._handlers = self._event_handlers()
@@ -169,7 +174,9 @@ class AlertHub:
         # First, so that no acknowledgement is applied to an alert that has become worse since.
         await self.flush()
         for alert, (by, at) in (await self._store.read(queries.acknowledgements)).items():
-            self.acknowledge(alert, by, at)
+            found = self.store.find(alert)
+            if found is not None and self._owns(found.robot_id):
+                self.acknowledge(alert, by, at)
         robots = await self._store.read(queries.list_robots)
         there = {each.id for each in robots}
         for each in robots:
@@ -320,10 +327,12 @@ class AlertHub:
         if self._runs % TOPICS_EVERY == 0:
             self._monitors.check_topics(now)
         if self._runs % SWEEP_EVERY == 0:
-            self._publish(self.store.sweep(self._now()))
+            self._publish(self.store.sweep(self._now(), self._owns))
             self.version += 1
         if self._absent and now - self._began >= ABSENT_SECONDS and self._leads():
             self._report_absent()
+        if self.on_written is not None and self._runs % MIRROR_EVERY == 0:
+            Deferred.fromCoroutine(self._mirror_stored()).addErrback(self._not_mirrored)
         self._flush_later()
         if self._shown != self.version:
             self._shown = self.version
@@ -388,7 +397,32 @@ class AlertHub:
             except BaseException:  # also an unexpected error, and a cancelled flush
                 self.store.put_back([*batch, *changed])
                 raise
+            if self.on_written is not None:
+                self.on_written(batch)
             changed = changed or self.store.take_changed()
+
+    # --- other relays of a cluster ------------------------------------------------------------------------
+
+    def mirror(self, alerts: Collection[AlertRecord]) -> None:
+        """Show what other relays have written too. Only the owner of a robot's alerts changes them afterwards."""
+        for each in alerts:
+            self.store.mirror(each, self._now())
+        self._publish(())
+
+    async def _mirror_stored(self) -> None:
+        """Find what other relays have written, in case their notices were lost."""
+        since = self._wall() - kinds.SHOWN_SECONDS
+        self.mirror(await self._store.read(queries.recent_alerts, since))
+
+    def _not_mirrored(self, failure: Any) -> None:
+        if not failure.check(SwitchboardError):
+            self.log.failure("the alerts of other relays could not be read", failure)
+
+    def _owns(self, robot_id: int) -> bool:
+        """Whether the alerts of a robot are this relay's: the robot is here, or nowhere and this relay leads."""
+        if self._registry.connected(robot_id):
+            return True
+        return not self._registry.is_elsewhere(robot_id) and self._leads()
 
     # --- rights -------------------------------------------------------------------------------------------
 

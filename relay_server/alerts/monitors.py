@@ -186,6 +186,10 @@ class Monitors:
             self._excuse_stall(now)
         self._checked_at = now
         for robot in self._registry:
+            if robot.elsewhere and robot.control_link is None:
+                # The relay that it is connected to checks it.
+                self._leave(robot, wall)
+                continue
             self._presence(robot, now, wall)
             self._battery(robot)
             self._stop(robot, now)
@@ -211,8 +215,6 @@ class Monitors:
     def _presence(self, robot: RobotState, now: float, wall: float) -> None:
         if robot.control_link is None:
             self._online.pop(robot.robot_id, None)
-            if robot.elsewhere:
-                robot.last_seen = wall
         elif self._online.get(robot.robot_id, (None, now))[0] != robot.session:
             self._online[robot.robot_id] = (robot.session, now)
         silence = self._silence(robot, now, wall)
@@ -221,7 +223,7 @@ class Monitors:
             self._maybe_offline.add(robot.robot_id)
         else:
             self._maybe_offline.discard(robot.robot_id)
-        if (robot.control_link is not None or robot.elsewhere) and not silent:
+        if robot.control_link is not None and not silent:
             self._sink.end(robot, kinds.OFFLINE)
         elif not silent or robot.last_seen is None or not (self._leads() or robot.control_link is not None):
             return
@@ -229,6 +231,11 @@ class Monitors:
             self._sink.raise_alert(
                 robot, kinds.OFFLINE, "", "error", "the robot is offline: no messages come from it"
             )
+
+    def _leave(self, robot: RobotState, wall: float) -> None:
+        self._online.pop(robot.robot_id, None)
+        self._maybe_offline.discard(robot.robot_id)
+        robot.last_seen = wall
 
     def _silence(self, robot: RobotState, now: float, wall: float) -> float:
         """Seconds since the robot was seen; by the monotonic clock alone if the wall clock was set meanwhile."""

@@ -108,12 +108,36 @@ class AlertStore:
             robot = self._robots.setdefault(each.robot_id, _Robot(filled=now.tick))
             key = (each.kind, each.about)
             (robot.open if each.over is None else robot.over)[key] = each
-            marks = robot.marks[key] = _Marks(now.ago(each.last if each.over is None else each.over))
-            if each.notification_count:
-                marks.notified, marks.severity = now.ago(each.last), kinds.severity(each.level)
-                marks.announced = each.over is None
+            robot.marks[key] = _marks(each, now)
             if each.over is None:
                 robot.over.pop(key, None)
+
+    def mirror(self, record: AlertRecord, now: Moment) -> None:
+        """Take over what another relay of the cluster has written, if it is newer; no user is notified again.
+
+        If both have raised the same alert, before they knew of each other's, the one that began first stays.
+        """
+        robot = self._robots.setdefault(record.robot_id, _Robot(filled=now.tick))
+        key = (record.kind, record.about)
+        lasts = robot.open.get(key)
+        mine = lasts if lasts is not None and lasts.id == record.id else robot.over.get(key)
+        if mine is not None and mine.id == record.id and _age(record) <= _age(mine):
+            return
+        if lasts is not None and lasts.id != record.id:
+            if record.over is not None:
+                return
+            kept, other = sorted((lasts, record), key=lambda each: (each.first, each.id))
+            self._changed[other.id] = other._replace(over=now.wall)
+            self.states += 1
+            if kept is lasts:
+                return
+        self.states += 1
+        robot.open.pop(key, None)
+        robot.over.pop(key, None)
+        (robot.open if record.over is None else robot.over)[key] = record
+        robot.marks[key] = _marks(record, now)
+        while len(robot.over) > MAX_OVER:
+            _forget(robot, next(iter(robot.over)))
 
     def take_changed(self) -> list[AlertRecord]:
         """The records to write, each once."""
@@ -222,11 +246,14 @@ class AlertStore:
         changes = self._end(robot, found, now) if kinds.endless(found.kind) else []
         return self.find(alert_id), changes
 
-    def sweep(self, now: Moment) -> list[AlertChange]:
-        """Announce alerts that came back and stayed, end those without an end of their own, drop old ones."""
+    def sweep(self, now: Moment, owned: Callable[[int], bool] = lambda robot_id: True) -> list[AlertChange]:
+        """Announce alerts that came back and stayed, end those without an end of their own, drop old ones.
+
+        :param owned: whether the alerts of a robot are this relay's; only these change
+        """
         changes: list[AlertChange] = []
         for robot_id, robot in list(self._robots.items()):
-            for key, each in list(robot.open.items()):
+            for key, each in list(robot.open.items()) if owned(robot_id) else ():
                 marks = robot.marks[key]
                 if now.tick - marks.since >= _timeout(each.kind):
                     changes += self._end(robot, each, now)
@@ -329,6 +356,21 @@ class AlertStore:
             return False
         robot.tokens -= 1
         return True
+
+
+def _marks(record: AlertRecord, now: Moment) -> _Marks:
+    """The marks of an alert that this relay has not raised itself, or has not since its start."""
+    marks = _Marks(now.ago(record.last if record.over is None else record.over))
+    if record.notification_count:
+        marks.notified, marks.severity = now.ago(record.last), kinds.severity(record.level)
+        marks.announced = record.over is None
+    return marks
+
+
+def _age(record: AlertRecord) -> tuple[float, int, int]:
+    """Greater for a later state of the same alert."""
+    latest = max(record.last, record.over or 0.0, record.ack_at or 0.0)
+    return latest, record.report_count, record.notification_count
 
 
 def _is_reserved(robot: _Robot, key: Key) -> bool:

@@ -12,6 +12,7 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_server import VERSION
+from relay_server.cluster.alert_notices import AlertNotices
 from relay_server.cluster.change_notices import ChangeNotices
 from relay_server.cluster.departed import DepartedRelays
 from relay_server.cluster.drain import Drain
@@ -84,6 +85,7 @@ class Cluster:
 
         self.notices = ChangeNotices(self.bus)
         self.file_notices = FileNotices(self.bus)
+        self.alert_notices = AlertNotices(self.bus, self.id)
         self.robot_facts = RobotFactsNotices(reactor, self.bus, robots, self.homes, self.id)
         self.status = ClusterStatus(self.bus, self.relays, self.homes, meter(), self.id)
         # Its averages are over its own seconds.
@@ -172,6 +174,7 @@ class Cluster:
         self.status.start()
         self.notices.start()
         self.file_notices.start()
+        self.alert_notices.start()
         self.robot_facts.start()
         await self.leadership.start()
         self.overload.start()
@@ -183,6 +186,7 @@ class Cluster:
             self._taking_over.cancel()
         self.notices.stop()
         self.file_notices.stop()
+        self.alert_notices.stop()
         self.robot_facts.stop()
         try:
             await self.leadership.stop()

@@ -207,6 +207,42 @@ def test_foxglove_at_another_relay_reaches_the_robot(fleet: Fleet) -> None:
                 client.recv(timeout=PATIENCE)
 
 
+def test_alerts_go_with_their_robot_and_are_shown_at_each_relay(fleet: Fleet) -> None:
+    """One alert of a stop stays one: shown and acknowledged at the other relay, and ended after the robot moved."""
+
+    def shown(relay: Relay) -> list[dict[str, Any]]:
+        url = f"http://127.0.0.1:{relay.http_port}/api/v1/robots/stream"
+        headers = {"Authorization": f"Bearer {fleet.token}", "Accept": "text/event-stream"}
+        with httpx.stream("GET", url, headers=headers, timeout=PATIENCE) as answer:
+            lines = iter(answer.iter_lines())
+            while next(lines) != "event: alerts":
+                pass
+            found = json.loads(next(lines).removeprefix("data:"))["alerts"]
+        return [each for each in found if each["kind"] == "stop" and each["text"].endswith(": moving house")]
+
+    assert fleet.request("POST", fleet.first, "/stop", json={"why": "moving house"}).status_code == 200
+    (alert,) = wait_for("the second shows it", lambda: shown(fleet.second))
+    assert alert["over"] is None
+    url = f"http://127.0.0.1:{fleet.second.http_port}/api/v1/alerts/{alert['id']}/acknowledge"
+    headers = {"Authorization": f"Bearer {fleet.token}"}
+    assert httpx.post(url, headers=headers, timeout=PATIENCE).json()["acknowledged"]["by"] == "ann"
+    wait_for("the first shows that", lambda: shown(fleet.first)[0]["acknowledged"])
+    fleet.connect_at(fleet.second, fleet.first)
+    assert [each["over"] for each in shown(fleet.second)] == [None]
+    fleet.resume(fleet.first)
+    for relay in fleet.relays:
+        wait_for("it has ended", lambda relay=relay: shown(relay)[0]["over"] is not None)
+    # Nothing of it was raised or ended by the other relay.
+    for relay in fleet.relays:
+        (ended,) = shown(relay)
+        assert (ended["id"], ended["notification_count"]) == (alert["id"], 2)
+    wait_for(
+        "it is written",
+        lambda: [each["id"] for each in fleet.alerts(fleet.first, "stop")][:1] == [alert["id"]],
+    )
+    fleet.connect_at(fleet.first, fleet.second)
+
+
 def test_lists_show_the_same_of_a_robot_at_each_relay(fleet: Fleet) -> None:
     """Also who uses it, and that it is stopped."""
     passing = {"rtt_ms", "last_seen"}

@@ -8,7 +8,7 @@ import pytest
 
 from relay_db.queries import AlertRecord
 from relay_server.alerts import types as kinds
-from relay_server.alerts.store import AlertChange, AlertStore, Moment
+from relay_server.alerts.store import MAX_OVER, AlertChange, AlertStore, Moment
 from relay_server.alerts.types import AlertEvent
 
 ROBOT = 1
@@ -377,3 +377,91 @@ def test_an_unknown_level_is_a_warning() -> None:
     assert kinds.known_level("disaster") == "warning"
     assert kinds.known_level("error") == "error"
     assert AlertEvent.WORSE.value == "worse"
+
+
+def mirrored(scene: Scene, *others: Scene) -> None:
+    """What one relay has written comes to the others."""
+    for record in scene.store.take_changed():
+        for each in others:
+            each.store.mirror(record, each.moment)
+
+
+def test_alerts_of_another_relay_are_shown_here_and_change_nothing(scene: Scene) -> None:
+    """They are continued here if their robot comes, and nobody is notified twice."""
+    other = Scene()
+    other.store._new_id = lambda: "b"
+    scene.report(text="low", level="warning")
+    mirrored(scene, other)
+    assert other.only == scene.only
+    assert (other.store.take_changed(), other.sweep()) == ([], [])
+    assert other.report(text="low", level="warning") == []
+    assert other.report(text="lower", level="error") == ["offline worse"]
+    assert other.end() == ["offline over"]
+    mirrored(other, scene)
+    assert scene.only == other.only
+    assert (scene.end(), scene.sweep(), scene.store.take_changed()) == ([], [], [])
+
+
+def test_an_older_state_of_an_alert_is_not_taken_over(scene: Scene) -> None:
+    """The database or a late notice may have one."""
+    other = Scene()
+    scene.report()
+    (before,) = scene.store.take_changed()
+    other.store.mirror(before, other.moment)
+    scene.now += 10
+    scene.store.acknowledge(before.id, "ann", scene.now, scene.moment)
+    (acknowledged,) = scene.store.take_changed()
+    scene.now += 10
+    scene.end()
+    (ended,) = scene.store.take_changed()
+    for record in (ended, acknowledged, before, ended):
+        other.store.mirror(record, other.moment)
+        assert other.only == ended
+    states = other.store.states
+    other.store.mirror(ended, other.moment)
+    assert other.store.states == states
+
+
+def test_of_the_same_alert_of_two_relays_the_first_stays(scene: Scene) -> None:
+    """Both have raised it before they knew of the other's. Each of them writes that the other one is over."""
+    other = Scene()
+    other.now += 0.5
+    other.store._new_id = lambda: "b"
+    scene.report()
+    other.report()
+    first, second = scene.store.take_changed(), other.store.take_changed()
+    scene.store.mirror(second[0], scene.moment)
+    other.store.mirror(first[0], other.moment)
+    assert scene.only == other.only == first[0]
+    for each in (scene, other):
+        (written,) = each.store.take_changed()
+        assert (written.id, written.over) == ("b", each.now)
+        scene.store.mirror(written, scene.moment)
+        other.store.mirror(written, other.moment)
+    assert scene.only == other.only == first[0]
+    assert scene.end() == ["offline over"]
+
+
+def test_only_the_owner_of_a_robot_ends_and_announces_its_alerts_by_time(scene: Scene) -> None:
+    other = Scene()
+    scene.report("robot")
+    mirrored(scene, other)
+    for each in (scene, other):
+        each.now += kinds.ENDLESS_SECONDS + 1
+    assert events(other.store.sweep(other.moment, lambda robot_id: False)) == []
+    assert events(scene.store.sweep(scene.moment, lambda robot_id: robot_id == ROBOT)) == ["robot over"]
+    mirrored(scene, other)
+    assert other.only.over is not None
+    other.now += kinds.SHOWN_SECONDS + 1
+    other.store.sweep(other.moment, lambda robot_id: False)
+    assert list(other.store) == []
+
+
+def test_ended_alerts_of_other_relays_are_bounded(scene: Scene) -> None:
+    other = Scene()
+    for number in range(MAX_OVER + 10):
+        scene.report("diagnostics", f"part {number}")
+        scene.now += 1
+        scene.end("diagnostics", f"part {number}")
+        mirrored(scene, other)
+    assert len(list(other.store)) == MAX_OVER
