@@ -4,7 +4,9 @@ Three relays, three NATS servers, one PostgreSQL, a robot that dials the relays 
 relays than the robot's: one drives, the other tries to. They call a service that moves the robot ten times a second,
 and connect again at the next relay when they are cut. Each fault comes once while they drive, and once with a stop that
 must still hold afterwards: confirmed before the fault, or, where it is the network between relays, sent to a relay that
-can't reach the robot's. The figures are a table for docs/operate/cluster.md.
+can't reach the robot's, by HTTP or by a websocket that was open before. All the time a user logs in at one relay after
+another, and each login that was answered must count at the next relay. The figures are a table for
+docs/operate/cluster.md.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ from tests.worlds.small_robot import SmallRobot
 from tests.worlds.waiting import wait_for
 
 CUT, SILENT = "the network to the home is cut", "the network to the home is silent"
+DATABASE_STILL, DATABASE_KILLED = "PostgreSQL stands still", "PostgreSQL is killed and started again"
 FAULTS = (
     "a door",
     "the home",
@@ -44,10 +47,15 @@ FAULTS = (
     SILENT,
     "one NATS server",
     "all of NATS",
-    "PostgreSQL",
+    DATABASE_STILL,
+    DATABASE_KILLED,
 )
 DOWN_SECONDS = 2.0
 """For as long a part is gone."""
+DATABASE_SECONDS = 8.0
+"""The same of the database."""
+NOTICE_SECONDS = 3.75
+"""After so long a robot's daemon connects to another relay, if its own says nothing."""
 SILENT_SECONDS = 14.0
 """The same of a network: longer than it takes a relay to notice."""
 
@@ -181,6 +189,59 @@ class Driver(threading.Thread):
         return "no answer"
 
 
+class Logins(threading.Thread):
+    """Logs in once a second, at one relay after another, and uses the session at the next one.
+
+    :ivar seen: times, and what came of each login but those that worked
+    :ivar done: logins that worked
+    :ivar lost: sessions that another relay did not know
+    """
+
+    def __init__(self, relays: list[ClusterRelay]) -> None:
+        super().__init__(daemon=True)
+        self.seen: list[tuple[float, str]] = []
+        self.done = 0
+        self.lost = 0
+        self.ends = False
+        self._relays = relays
+
+    def run(self) -> None:
+        for number in itertools.count():
+            if self.ends:
+                return
+            status, cookie = self._ask(number, {"user": "ann", "password": "correct horse"})
+            if status == 200:
+                self.done += 1
+                self._use(number + 1, cookie)
+            else:
+                self.seen.append((time.monotonic(), f"login: {status or 'no answer'}"))
+            time.sleep(1.0)
+
+    def _use(self, number: int, cookie: str) -> None:
+        """Show the session to other relays until one says whether it counts."""
+        while not self.ends:
+            status, _ = self._ask(number, None, Cookie=cookie)
+            if status in (200, 401):
+                self.lost += status == 401
+                return
+            number += 1
+            time.sleep(0.5)
+
+    def _ask(self, number: int, body: dict[str, str] | None, **headers: str) -> tuple[int, str]:
+        """Status and cookie; 0 if there is no answer."""
+        relay = self._relays[number % len(self._relays)]
+        url = f"http://127.0.0.1:{relay.http_port}/api/v1/session"
+        sent = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(url, sent, {"Content-Type": "application/json", **headers})
+        try:
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                return answer.status, str(answer.headers.get("Set-Cookie", "")).partition(";")[0]
+        except HTTPError as error:
+            return error.code, ""
+        except OSError:
+            return 0, ""
+
+
 class Scene:
     """The cluster, its robot and its drivers."""
 
@@ -201,14 +262,17 @@ class Scene:
         doors = [[*self.relays[at:], *self.relays[:at]] for at in (1, 2)]
         self.drivers = [Driver(each, token, self.robot) for each, token in zip(doors, tokens, strict=True)]
 
+        self.logins = Logins(self.relays)
+        threads = [*self.drivers, self.logins]
+
         def over() -> None:
-            for each in self.drivers:
+            for each in threads:
                 each.ends = True
-            for each in self.drivers:
+            for each in threads:
                 each.join(30)
 
         stack.callback(over)
-        for each in self.drivers:
+        for each in threads:
             each.start()
         time.sleep(0.5)
 
@@ -248,6 +312,26 @@ class Scene:
         wait_for("the robot has stopped", lambda: self.robot.stopped is not None, QUIET_SECONDS)
         return time.monotonic() - began
 
+    @contextlib.contextmanager
+    def open_websocket(self) -> Iterator[Any]:
+        """A websocket at a relay that is not the robot's."""
+        url = f"ws://127.0.0.1:{self._other().http_port}/robots/rover"
+        headers = {"Authorization": f"Bearer {self._token}"}
+        with connect(url, additional_headers=headers, open_timeout=5, close_timeout=1) as socket:
+            yield socket
+
+    def stop_by_websocket(self, socket: Any) -> float:
+        """Stop the robot so; returns the seconds until it has stopped. The client has an answer then, or soon."""
+        began = time.monotonic()
+        socket.send(json.dumps({"op": "call_service", "service": "/relay/stop", "id": "stop", "args": {}}))
+        wait_for("the robot has stopped", lambda: self.robot.stopped is not None, QUIET_SECONDS)
+        stopped = time.monotonic() - began
+        while True:
+            message = json.loads(socket.recv(ANSWER_SECONDS))
+            if message.get("op") == "service_response" and message.get("id") == "stop":
+                assert message["values"]["success"], message
+                return stopped
+
     def _home(self) -> ClusterRelay:
         return next((each for each in self.relays if each is self.robot.relay), self.relays[0])
 
@@ -281,8 +365,7 @@ class Scene:
             relay.start()
         elif fault == "the home stands still":
             home.freeze()
-            time.sleep(1.0)
-            # The daemon misses the relay's heartbeats after two of them.
+            time.sleep(NOTICE_SECONDS)
             self.robot.drop()
             yield
             home.thaw()
@@ -293,7 +376,14 @@ class Scene:
                 link.reset()
             yield
             link.heal()
-        elif fault == "PostgreSQL":
+        elif fault == DATABASE_KILLED:
+            server = _postgres_server()
+            for each in _own_postgres():
+                with contextlib.suppress(psutil.Error):
+                    each.kill()
+            yield
+            server.ensure_postgres_running()
+        elif fault == DATABASE_STILL:
             processes = _own_postgres()
             for each in processes:
                 with contextlib.suppress(psutil.Error):
@@ -322,6 +412,14 @@ def _own_postgres() -> list[psutil.Process]:
     return found
 
 
+def _postgres_server() -> Any:
+    """The server itself, which can be started again."""
+    from pgserver.postgres_server import get_server
+
+    words = next(each.cmdline() for each in _own_postgres() if "-D" in each.cmdline())
+    return get_server(Path(words[words.index("-D") + 1]))
+
+
 class Ended:
     """What one fault did.
 
@@ -329,6 +427,8 @@ class Ended:
     :ivar stop: time until a stop by another way has stopped the robot, seconds
     :ivar late: calls that the robot executed after their end
     :ivar two: calls of one who had no control
+    :ivar unconfirmed: whether a stop before the fault was not confirmed
+    :ivar said: how calls and logins ended that did not work
     """
 
     def __init__(self) -> None:
@@ -337,23 +437,36 @@ class Ended:
         self.late = 0
         self.two = 0
         self.lost_stop = False
+        self.unconfirmed = False
         self.never = False
         self.said: Counter[str] = Counter()
 
 
-def trial(at: Scene, fault: str, stopped: bool) -> Ended:
-    """One fault, and what came of it."""
+def trial(at: Scene, fault: str, stopped: bool, number: int) -> Ended:
+    """One fault, and what came of it.
+
+    :param number: of the trial; a stop to a silent network alternates between HTTP and a websocket
+    """
     ended, began = Ended(), time.monotonic()
     wait_for("a driver drives", lambda: at.drives(began), QUIET_SECONDS)
-    began = time.monotonic()
+    began = fault_began = time.monotonic()
     robot_from, calls_from = len(at.robot.moved), [len(each.calls) for each in at.drivers]
     network = fault in (CUT, SILENT)
     confirmed = stopped and not network and at.stop()
-    with at.broken(fault):
+    ended.unconfirmed = stopped and not network and not confirmed
+    seconds = DOWN_SECONDS
+    if fault in (DATABASE_STILL, DATABASE_KILLED):
+        seconds = DATABASE_SECONDS
+    elif fault == SILENT:
+        seconds = SILENT_SECONDS
+    with contextlib.ExitStack() as stack:
+        by_websocket = stopped and fault == SILENT and number % 2
+        socket = stack.enter_context(at.open_websocket()) if by_websocket else None
+        stack.enter_context(at.broken(fault))
         if stopped and network:
-            ended.stop, confirmed = at.stop_by_another_way(), True
-            began = time.monotonic()
-        time.sleep(SILENT_SECONDS if fault == SILENT else DOWN_SECONDS)
+            ended.stop = at.stop_by_another_way() if socket is None else at.stop_by_websocket(socket)
+            confirmed, began = True, time.monotonic()
+        time.sleep(seconds)
     if confirmed:
         wait_for("the robot is back", lambda: at.robot.connected, QUIET_SECONDS)
         time.sleep(1.0)
@@ -381,6 +494,7 @@ def trial(at: Scene, fault: str, stopped: bool) -> Ended:
         ended.gap = max((b - a for a, b in itertools.pairwise(times)), default=0.0)
     for each, since in zip(at.drivers, calls_from, strict=True):
         ended.said.update(said for _, _, said in each.calls[since:] if said != "ok")
+    ended.said.update(said for when, said in at.logins.seen if when > fault_began)
     return ended
 
 
@@ -397,16 +511,19 @@ def main() -> int:
         nats = stack.enter_context(nats_cluster(folder / "nats"))
         at = Scene(stack, folder / "relays", url, nats)
         print(
-            "| fault | times | late | without control | stops lost | longest without a driver | longest stop |"
+            "| fault | times | late | without control | stops lost | longest without a driver | longest stop | seen |"
         )
-        print("|---|---|---|---|---|---|---|", flush=True)
+        print("|---|---|---|---|---|---|---|---|", flush=True)
         for fault in asked.faults or FAULTS:
-            ends = [trial(at, fault, stopped) for _ in range(asked.runs) for stopped in (False, True)]
+            ends = [
+                trial(at, fault, stopped, number) for number in range(asked.runs) for stopped in (False, True)
+            ]
             said: Counter[str] = sum((each.said for each in ends), Counter())
             wrong = {
                 "late": sum(each.late for each in ends),
                 "without control": sum(each.two for each in ends),
                 "stops lost": sum(each.lost_stop for each in ends),
+                "stops not confirmed": sum(each.unconfirmed for each in ends),
                 "never again": sum(each.never for each in ends),
             }
             bad += sum(wrong.values())
@@ -415,10 +532,13 @@ def main() -> int:
             counts = " | ".join(str(wrong[each]) for each in ("late", "without control", "stops lost"))
             again = f", {wrong['never again']} times for ever" if wrong["never again"] else ""
             longest_stop = f"{stop:.1f} s" if stop else "-"
+            seen = ", ".join(f"{what} ({count})" for what, count in said.most_common(8))
             print(
-                f"| {fault} | {len(ends)} | {counts} | {longest:.1f} s{again} | {longest_stop} |", flush=True
+                f"| {fault} | {len(ends)} | {counts} | {longest:.1f} s{again} | {longest_stop} | {seen} |",
+                flush=True,
             )
-            print(f"drivers saw {dict(said.most_common(8))}", file=sys.stderr, flush=True)
+        print(f"\n{at.logins.done} logins, {at.logins.lost} of them lost", flush=True)
+        bad += at.logins.lost
     return int(bad > 0)
 
 

@@ -15,7 +15,7 @@ MOST_RECORDS = 100
 """Most alerts in one notice; a text has at most 500 characters."""
 
 
-class AlertNotice(msgspec.Struct, array_like=True, frozen=True):
+class WrittenAlerts(msgspec.Struct, array_like=True, frozen=True):
     """Alerts that were written.
 
     :param relay: id of the relay that has written them
@@ -52,12 +52,12 @@ class AlertNotices:
         """This relay has written alerts."""
         alerts = list(alerts)
         for at in range(0, len(alerts), MOST_RECORDS):
-            notice = AlertNotice(self._own, alerts[at : at + MOST_RECORDS])
+            notice = WrittenAlerts(self._own, alerts[at : at + MOST_RECORDS])
             self._bus.publish(SUBJECT, msgspec.json.encode(notice))
 
     def _received(self, subject: str, body: bytes) -> None:
         try:
-            notice = msgspec.json.decode(body, type=AlertNotice)
+            notice = msgspec.json.decode(body, type=WrittenAlerts)
         except msgspec.DecodeError as error:
             self.log.error("a notice of the bus can't be read: {error}", error=error, limited="notice")
             return

@@ -17,7 +17,9 @@ from relay_server.cluster.bus import BusLease, ClusterBus, LeaseUnavailable
 LEASES = "relays"
 READ_SECONDS = 2.0
 """Seconds between reads of all leases."""
-CLUSTER_PROTOCOL = 1
+CONFIRMING_PROTOCOL = 2
+"""Version from which a relay repeats the number of a ping, and Foxglove's stop has a fixed number."""
+CLUSTER_PROTOCOL = 2
 """Version of what relays say to each other: notices, questions, headers of forwarded requests. A change that relays of
 the version before can't work with raises it; :data:`OLDEST_PROTOCOL` follows one release later."""
 OLDEST_PROTOCOL = 1

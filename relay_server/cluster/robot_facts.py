@@ -1,12 +1,13 @@
 """What lists show of the robots of other relays: each relay publishes the facts of its own robots on the bus.
 
 They are sent when something of them changes, and all again within ten seconds, for relays that have missed some. A
-reader's rights are applied where the list is made.
+reader's rights are applied where the list is made. What changes all the time is sent every ten seconds only, so that no
+reader learns from it when something has changed that is hidden from them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import msgspec
@@ -24,11 +25,9 @@ PERIOD = 0.5
 """Seconds between looks for changes."""
 ROUNDS = 20
 """Number of looks in which the facts of all robots are sent once, changed or not."""
-MOST_BYTES = 128 * KIB
-"""Most bytes of one notice; the facts of one robot may be longer."""
-MOST_CLIENTS = 1000
-"""Most clients and viewers of one robot that other relays list."""
-FORGET_SECONDS = 30.0
+MOST_BYTES = 64 * KIB
+"""Most bytes of one notice. Of a robot with more, only the first clients and viewers are sent."""
+FORGET_SECONDS = 15.0
 """Seconds after which facts that were not sent again are no longer shown."""
 
 PASSING = ("rtt_ms", "last_seen")
@@ -47,9 +46,15 @@ class RobotFactsNotice(msgspec.Struct, array_like=True, frozen=True):
 
 
 class _OthersFacts(NamedTuple):
-    relay: str
+    """:param at: monotonic seconds"""
+
     at: float
     facts: RobotFacts
+
+
+class _SentFacts(NamedTuple):
+    lasting: dict[str, Any]
+    passing: dict[str, Any]
 
 
 class RobotFactsNotices:
@@ -70,15 +75,17 @@ class RobotFactsNotices:
         self._robots = robots
         self._homes = homes
         self._own = own
-        self._sent: dict[int, dict[str, Any]] = {}
-        """The lasting facts of this relay's robots that were sent last."""
-        self._known: dict[int, _OthersFacts] = {}
+        self._sent: dict[int, _SentFacts] = {}
+        """The facts of this relay's robots that were sent last."""
+        self._known: dict[tuple[int, str], _OthersFacts] = {}
+        """Facts by robot and relay. One that a robot has left may send them later than the one that it came to."""
         self._changed = True
         """Whether robots may have changed since the last look."""
         self._round = 0
         self._ends: list[Callable[[], None]] = []
         self._loop = LoopingCall(self._look)
         self._loop.clock = reactor
+        bus.on_state(self._bus_state)
 
     def start(self) -> None:
         """Publish, and follow the others."""
@@ -95,11 +102,15 @@ class RobotFactsNotices:
 
     def find(self, robot_id: int) -> RobotFacts | None:
         """Facts of a robot that is connected to another relay; ``None``: they are not known."""
-        known = self._known.get(robot_id)
-        if known is None or self._seconds() - known.at > FORGET_SECONDS:
-            return None
-        home = self._homes.elsewhere(robot_id)
-        return known.facts if home is not None and home.id == known.relay else None
+        home = self._homes.elsewhere(robot_id) if self._bus.connected else None
+        known = None if home is None else self._known.get((robot_id, home.id))
+        return None if known is None or self._seconds() - known.at > FORGET_SECONDS else known.facts
+
+    def _bus_state(self, connected: bool) -> None:
+        if connected:
+            # What was published meanwhile is lost.
+            self.send_all()
+        self._robots.changed()
 
     def send_all(self) -> None:
         """Send all facts with the next look: a relay has come that knows none."""
@@ -114,32 +125,44 @@ class RobotFactsNotices:
     def _look(self) -> None:
         changed, self._changed = self._changed, False
         self._round = (self._round + 1) % ROUNDS
-        if self.facts_of is None:
-            return
-        sending: list[tuple[int, RobotFacts]] = []
+        try:
+            self._send(self._news(changed))
+        except Exception:
+            self.log.failure("what other relays show of robots could not be sent", limited="facts")
+        if self._round == 0:
+            self._forget()
+
+    def _news(self, changed: bool) -> Iterator[tuple[int, RobotFacts]]:
+        """What is to be sent now.
+
+        :param changed: whether robots may have changed
+        """
         for robot in self._robots:
             due = robot.robot_id % ROUNDS == self._round
-            if robot.control_link is None:
+            if robot.control_link is None or self.facts_of is None:
                 self._sent.pop(robot.robot_id, None)
             elif changed or due:
                 facts = self.facts_of(robot)
-                lasting = _lasting(facts)
-                if due or self._sent.get(robot.robot_id) != lasting:
-                    self._sent[robot.robot_id] = lasting
-                    sending.append((robot.robot_id, {**facts, "clients": facts["clients"][:MOST_CLIENTS]}))
-        self._send(sending)
-        if self._round == 0:
-            self._forget()
+                lasting, before = _lasting(facts), self._sent.get(robot.robot_id)
+                if due or before is None or before.lasting != lasting:
+                    passing: Any = (
+                        {"rtt_ms": facts["rtt_ms"], "last_seen": facts["last_seen"]}
+                        if due or before is None
+                        else before.passing
+                    )
+                    self._sent[robot.robot_id] = _SentFacts(lasting, passing)
+                    yield robot.robot_id, {**facts, **passing}
 
     def _send(self, robots: Iterable[tuple[int, RobotFacts]]) -> None:
         together: list[tuple[int, RobotFacts]] = []
         size = 0
-        for each in robots:
-            length = len(msgspec.json.encode(each))
+        for number, facts in robots:
+            while (length := len(msgspec.json.encode(facts))) > MOST_BYTES and facts["clients"]:
+                facts = {**facts, "clients": facts["clients"][: len(facts["clients"]) // 2]}
             if together and size + length > MOST_BYTES:
                 self._publish(together)
                 together, size = [], 0
-            together.append(each)
+            together.append((number, facts))
             size += length
         if together:
             self._publish(together)
@@ -159,17 +182,16 @@ class RobotFactsNotices:
             return
         now, changed = self._seconds(), False
         for robot_id, facts in notice.robots:
-            before = self._known.get(robot_id)
+            key = robot_id, notice.relay
+            before = self._known.get(key)
             changed = changed or before is None or _lasting(before.facts) != _lasting(facts)
-            self._known[robot_id] = _OthersFacts(notice.relay, now, facts)
+            self._known[key] = _OthersFacts(now, facts)
         if changed:
             self._robots.changed()
 
     def _forget(self) -> None:
         now = self._seconds()
-        self._known = {
-            number: each for number, each in self._known.items() if now - each.at <= FORGET_SECONDS
-        }
+        self._known = {key: each for key, each in self._known.items() if now - each.at <= FORGET_SECONDS}
 
 
 def _lasting(facts: RobotFacts) -> dict[str, Any]:

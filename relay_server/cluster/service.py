@@ -169,13 +169,13 @@ class Cluster:
         await self.relays.refresh(acquire=False)
         for relay in self.relays:
             check_compatible(relay)
+        self.alert_notices.start()
+        self.robot_facts.start()
         await self.relays.start()
         await self.homes.start()
         self.status.start()
         self.notices.start()
         self.file_notices.start()
-        self.alert_notices.start()
-        self.robot_facts.start()
         await self.leadership.start()
         self.overload.start()
 

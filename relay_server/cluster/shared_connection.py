@@ -200,8 +200,8 @@ class StreamTransport:
         self._producer = None
 
     def confirm(self, seconds: float) -> Deferred[bool]:
-        """See :meth:`SharedConnection.confirm`."""
-        return self._shared.confirm(seconds)
+        """See :meth:`SharedConnection.confirm`. What is written to a stream that has ended is never read."""
+        return succeed(False) if self.disconnecting or self._over else self._shared.confirm(seconds)
 
     # --- IPushProducer ------------------------------------------------------------------------------------
 
@@ -322,6 +322,8 @@ class SharedConnection(TwistedProtocol):
         self._ping_timer: Timer | None = None
         self._confirming: dict[int, tuple[Deferred[bool], Timer]] = {}
         """Those that wait for the answer to a ping, by its number; and when they give up."""
+        self._receptions = 0
+        """How often bytes have come."""
         self._confirmations = 0
         self._numbers: tuple[int, ...] = ()
         self._left = 0
@@ -358,16 +360,28 @@ class SharedConnection(TwistedProtocol):
     def confirm(self, seconds: float) -> Deferred[bool]:
         """Ask whether the other relay has read what was written before. For the side that has connected.
 
-        :returns: fires with false if that is not known within so many seconds
+        :returns: fires with false if that is not known within so many seconds, or three times as many if other bytes
+            come meanwhile, behind which the answer may wait
         """
         if self._lost:
             return succeed(False)
         self._confirmations += 1
         number = self._confirmations
         confirming: Deferred[bool] = Deferred()
-        self._confirming[number] = confirming, self.clock.callLater(seconds, self._confirm, number, False)
+        timer = self.clock.callLater(seconds, self._not_confirmed, number, seconds, self._receptions)
+        self._confirming[number] = confirming, timer
         self.send_control(FrameKind.PING, number)
         return confirming
+
+    def _not_confirmed(self, number: int, seconds: float, receptions: int) -> None:
+        confirming, _ = self._confirming[number]
+        if self._receptions == receptions:
+            self._confirm(number, False)
+        else:
+            self._confirming[number] = (
+                confirming,
+                self.clock.callLater(2 * seconds, self._confirm, number, False),
+            )
 
     def _confirm(self, number: int, read: bool) -> None:
         if number in self._confirming:
@@ -499,6 +513,7 @@ class SharedConnection(TwistedProtocol):
     def dataReceived(self, data: bytes) -> None:
         """Pass on the bytes of streams as they come."""
         self._unanswered = 0
+        self._receptions += 1
         if self._rest:
             data, self._rest = self._rest + data, b""
         at, size = 0, len(data)

@@ -20,11 +20,12 @@ from twisted.internet.protocol import connectionDone
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_protocol.limits import KIB
 from relay_server.access import BadCredentials
 from relay_server.cluster.forwarding import ForwardedClient, Forwarder, without_credentials
-from relay_server.cluster.relays import RelayInfo, check_compatible, unreachable
+from relay_server.cluster.relays import CONFIRMING_PROTOCOL, RelayInfo, check_compatible, unreachable
 from relay_server.common import close_codes
-from relay_server.common.clock import Clock
+from relay_server.common.clock import Clock, Timer, cancel
 from relay_server.common.concurrency import with_timeout
 from relay_server.common.send_queue import SendQueue
 from relay_server.common.tcp import PushProducer
@@ -39,6 +40,13 @@ OPEN_SECONDS = 5.0
 
 MOST_PONGS = 16
 """Most answers to pings that wait for the end of a fragmented message; the newest count."""
+
+PAUSED_SECONDS = 0.5
+"""Seconds in which the home takes no bytes, after which the client is read again all the same: it may want to stop the
+robot, which another way than by the home can do."""
+
+PAUSED_BYTES = 64 * KIB
+"""Bytes that are read of it then."""
 
 UNSENT_BYTES = 4 << 20
 """When so many bytes were written while the home takes none, one more message closes the websocket. A single one may
@@ -131,6 +139,9 @@ class ForwardedWebSocket:
         self._ended = False
         self._paused_bytes: int | None = None
         """Bytes sent to the home since it takes none; ``None``: it takes bytes."""
+        self._paused_timer: Timer | None = None
+        self.answers: list[bytes] = []
+        """Frames of this relay that wait for the end of a message of the home."""
         self._opening: Deferred[None] = Deferred()
         self.on_message: Callable[[bytes, bool], object] = _ignore
         """Called with each message that was forwarded, and whether it is binary."""
@@ -168,14 +179,27 @@ class ForwardedWebSocket:
         self._send(masked(BINARY, payload))
         self.on_message(payload, True)
 
+    @property
+    def confirms(self) -> bool:
+        """Whether the home can say what it has read."""
+        return self._relay.protocol >= CONFIRMING_PROTOCOL
+
     async def confirm(self, seconds: float) -> bool:
-        """Whether the home has read all messages within some seconds; false if it is not known."""
-        return self._home is not None and await self._home.transport.confirm(seconds)
+        """Whether the home has read all messages; false if that is not known, see :meth:`SharedConnection.confirm`."""
+        if self._ended or self._home is None:
+            return False
+        return bool(await self._home.transport.confirm(seconds))
 
     def answer(self, frame: bytes) -> None:
-        """Send the client a frame of this relay, unless that would divide a message of the home."""
-        if not self._ended and self._home is not None and not self._home.inside_message:
-            self.frames(frame)
+        """Send the client a frame of this relay, behind the message of the home of which it has a part already."""
+        self.answers.append(frame)
+        if self._home is not None and not (self._home.inside_frame or self._home.inside_message):
+            self.send_answers()
+
+    def send_answers(self) -> None:
+        """The client has only whole messages of the home."""
+        answers, self.answers = self.answers, []
+        self.frames(b"".join(answers))
 
     def ping(self) -> None:
         """The home pings."""
@@ -219,6 +243,7 @@ class ForwardedWebSocket:
         if self._ended:
             return
         self._ended = True
+        cancel(self._paused_timer)
         self._forwarder.websockets.discard(self)
         if self._home is None:
             return
@@ -239,6 +264,8 @@ class ForwardedWebSocket:
         self._home.transport.write(b"".join([frame, *pongs]))
         if self._paused_bytes is not None:
             self._paused_bytes += len(frame)
+            if self._paused_bytes > PAUSED_BYTES:
+                self._transport.pause_reading()
 
     # --- flow to the home ---------------------------------------------------------------------------------
 
@@ -246,10 +273,13 @@ class ForwardedWebSocket:
         """The home takes no bytes, so the client is not read."""
         self._paused_bytes = 0
         self._transport.pause_reading()
+        cancel(self._paused_timer)
+        self._paused_timer = self._clock.callLater(PAUSED_SECONDS, self._transport.resume_reading)
 
     def home_resumed(self) -> None:
         """The home takes bytes again."""
         self._paused_bytes = None
+        cancel(self._paused_timer)
         self._transport.resume_reading()
 
     # --- the home -----------------------------------------------------------------------------------------
@@ -419,6 +449,8 @@ class _HomeConnection(TwistedProtocol):
             _HomeConnection.whole = came
         if at:
             self._client.frames(data[:at])
+        if self._client.answers and not (self._left or self.inside_message):
+            self._client.send_answers()
 
     def _closed(self, payload: bytes) -> None:
         code = int.from_bytes(payload[:2], "big") if len(payload) > 1 else 1000

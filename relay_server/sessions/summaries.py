@@ -129,11 +129,15 @@ class RobotSummaries:
         """The facts of a robot, which its own relay knows."""
         robot = self._of(record)
         facts = self.facts_of(robot)
-        there = self.facts_elsewhere(robot.robot_id) if robot.elsewhere else None
-        if there is None:
+        if not robot.elsewhere:
             return facts
-        # A stop may be on its way there.
-        return {**there, "stopped": there["stopped"] or facts["stopped"]}
+        # Of its motion, only a stop that is on its way there is known here.
+        stop = facts["stopped"]
+        coming = None if stop is None or stop["confirmed"] else stop
+        there = self.facts_elsewhere(robot.robot_id)
+        if there is None:
+            return {**facts, "stopped": coming, "suppressed": [], "inhibited": []}
+        return {**there, "stopped": there["stopped"] or coming}
 
     def facts_of(self, robot: RobotState) -> RobotFacts:
         """The facts of a robot, as far as this relay knows them itself."""

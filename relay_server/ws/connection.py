@@ -342,7 +342,7 @@ class ClientConnection(BoundedProtocol):
         if forwarded is not None:
             self.factory.sessions.release(admission)
             self._binary_handler = forwarded
-            if self.has_dialects:
+            if self.has_dialects and forwarded.confirms:
                 # Given as the client named it; the client may have left when it is called.
                 stop = partial(self._stop_here, admission.permit.principal, self._robot, self._address())
                 stops = ForwardedStops(forwarded, admission.robot.name, self._foxglove, stop)

@@ -27,7 +27,7 @@ from relay_server.sessions.service_calls import STOP, STOPPING_CALLS, own_argume
 
 CONFIRM_SECONDS = 1.0
 """Seconds in which the home must have read a stop."""
-MOST_BYTES = 128 * KIB
+MOST_BYTES = 16 * KIB
 """Most bytes of a message that is looked at."""
 _REQUEST = f"{interfaces.SERVICES[STOP].type}_Request"
 
@@ -38,11 +38,11 @@ StopHere = Callable[[str, str], Coroutine[Any, Any, StopResult]]
 class _Stop(NamedTuple):
     """A client's call of ``/relay/stop``.
 
+    :param args: decodes its arguments
     :param answer: makes the frame of the answer from its values
     """
 
-    why: str
-    stop_id: str
+    args: Callable[[], Any]
     answer: Callable[[Any], bytes]
 
 
@@ -81,7 +81,7 @@ class ForwardedStops:
         try:
             if await self._forwarded.confirm(CONFIRM_SECONDS):
                 return
-            result = await self._stop(stop.why, stop.stop_id)
+            result = await self._stop(*stop_arguments(stop.args()))
         except SwitchboardError as error:
             self.log.warn(
                 "a stop of {robot}, whose relay is silent, failed: {reason}",
@@ -109,7 +109,7 @@ def _rosbridge_stop(payload: bytes) -> _Stop | None:
     def answer(values: Any) -> bytes:
         return websocket_frames.text(rosbridge.service_response(service, id, True, jsontext.encode(values)))
 
-    return _Stop(*stop_arguments(own_arguments(STOP, bytes(call.args or b""))), answer)
+    return _Stop(lambda: own_arguments(STOP, bytes(call.args or b"")), answer)
 
 
 def _foxglove_stop(payload: bytes) -> _Stop | None:
@@ -119,16 +119,18 @@ def _foxglove_stop(payload: bytes) -> _Stop | None:
         return None
     if not isinstance(call, messages.ServiceCallMessage):
         return None
-    args: Any = {}
-    if call.encoding == "json":
-        args = own_arguments(STOP, call.payload)
-    elif call.encoding == "cdr":
-        with suppress(SwitchboardError):
-            args = jsontext.decode_any(interfaces.TYPES.to_json(_REQUEST, call.payload))
-    number = call.call
+    number, encoding, payload = call.call, call.encoding, call.payload
+
+    def args() -> Any:
+        if encoding == "json":
+            return own_arguments(STOP, payload)
+        if encoding == "cdr":
+            with suppress(SwitchboardError):
+                return jsontext.decode_any(interfaces.TYPES.to_json(_REQUEST, payload))
+        return {}
 
     def answer(values: Any) -> bytes:
         reason = values["message"]
         return messages.text("serviceCallFailure", serviceId=STOP_NUMBER, callId=number, message=reason)
 
-    return _Stop(*stop_arguments(args), answer)
+    return _Stop(args, answer)

@@ -231,6 +231,7 @@ def test_alerts_go_with_their_robot_and_are_shown_at_each_relay(fleet: Fleet) ->
     assert [each["over"] for each in shown(fleet.second)] == [None]
     fleet.resume(fleet.first)
     for relay in fleet.relays:
+        wait_for("it shows no stop", lambda relay=relay: fleet.listed(relay)["stopped"] is None)
         wait_for("it has ended", lambda relay=relay: shown(relay)[0]["over"] is not None)
     # Nothing of it was raised or ended by the other relay.
     for relay in fleet.relays:

@@ -13,7 +13,6 @@ from relay_server.cluster.relays import RelayInfo
 from relay_server.cluster.robot_facts import (
     FORGET_SECONDS,
     MOST_BYTES,
-    MOST_CLIENTS,
     PERIOD,
     ROUNDS,
     SUBJECT,
@@ -72,13 +71,14 @@ class Relays:
         self.first.start()
         self.second.start()
         self.notices: list[RobotFactsNotice] = []
+        self.sizes: list[int] = []
         self.bus.subscribe(SUBJECT, self._note)
 
     def _changed(self) -> None:
         self.changes += 1
 
     def _note(self, subject: str, body: bytes) -> None:
-        assert len(body) <= MOST_BYTES + 2000 * 60
+        self.sizes.append(len(body))
         self.notices.append(msgspec.json.decode(body, type=RobotFactsNotice))
 
     def elsewhere(self, robot_id: int) -> RelayInfo | None:
@@ -117,14 +117,18 @@ def test_facts_of_a_robot_are_known_at_the_other_relay(relays: Relays) -> None:
 
 
 def test_what_passes_is_sent_with_the_next_round_and_is_no_change(relays: Relays) -> None:
+    """Also if something else changes: a reader who may not see that must not learn when it did."""
     relays.has(3)
-    relays.passes(1)
+    relays.passes(2)
     relays.has(3, rtt_ms=7.0, last_seen=9.0)
     sent = len(relays.notices)
-    relays.passes(PERIOD * ROUNDS)
-    assert len(relays.notices) == sent + 1
-    assert relays.second.find(3) == facts(rtt_ms=7.0, last_seen=9.0)
-    assert relays.changes == 1
+    relays.has(3, rtt_ms=7.0, last_seen=9.0, holder="ann")
+    relays.passes(2)
+    assert relays.second.find(3) == facts(holder="ann")
+    relays.passes(PERIOD * ROUNDS - 2)
+    assert len(relays.notices) == sent + 2
+    assert relays.second.find(3) == facts(rtt_ms=7.0, last_seen=9.0, holder="ann")
+    assert relays.changes == 2
 
 
 def test_facts_count_only_from_the_relay_that_has_the_robot(relays: Relays) -> None:
@@ -133,8 +137,28 @@ def test_facts_count_only_from_the_relay_that_has_the_robot(relays: Relays) -> N
     relays.passes(1)
     relays.homes[3] = "c"
     assert relays.second.find(3) is None
+    there = RobotFactsNotice("c", [(3, facts(holder="ann"))])
+    relays.bus.publish(SUBJECT, msgspec.json.encode(there))
+    relays.passes(10)
+    assert relays.second.find(3) == facts(holder="ann")
     del relays.homes[3]
     assert relays.second.find(3) is None
+
+
+def test_without_the_bus_nothing_is_known_and_all_is_sent_after_it(relays: Relays) -> None:
+    """What is published meanwhile is lost."""
+    relays.has(3)
+    relays.passes(2)
+    relays.bus.connected = False
+    assert relays.second.find(3) is None
+    relays.has(3, holder="ann")
+    publish, relays.bus.publish = relays.bus.publish, lambda subject, body: None  # type: ignore[method-assign]
+    relays.passes(1)
+    relays.bus.connected, relays.bus.publish = True, publish  # type: ignore[method-assign]
+    for each in (relays.first, relays.second):
+        each._bus_state(True)
+    relays.passes(1)
+    assert relays.second.find(3) == facts(holder="ann")
 
 
 def test_facts_that_are_not_sent_again_are_forgotten(relays: Relays) -> None:
@@ -160,16 +184,30 @@ def test_a_relay_that_comes_gets_all_soon(relays: Relays) -> None:
 
 
 def test_notices_are_bounded(relays: Relays) -> None:
-    clients = [{"user": f"user{number}", "since": 1.0, "camera": ""} for number in range(2 * MOST_CLIENTS)]
+    clients = [{"user": f"user{number}", "since": 1.0, "camera": "\0" * 200} for number in range(2000)]
     for number in range(100):
-        relays.has(number, clients=clients[:100])
+        relays.has(number, clients=clients[:20])
     relays.has(100, clients=clients)
     relays.passes(1)
+    assert max(relays.sizes) <= 2 * MOST_BYTES
     assert len(relays.notices) > 2
     assert len({number for each in relays.notices for number, _ in each.robots}) == 101
     known = relays.second.find(100)
     assert known is not None
-    assert len(known["clients"]) == MOST_CLIENTS
+    assert 20 < len(known["clients"]) < 2000
+    assert known["clients"] == clients[: len(known["clients"])]
+
+
+def test_a_robot_whose_facts_can_not_be_had_ends_nothing(
+    relays: Relays, caplog: pytest.LogCaptureFixture
+) -> None:
+    relays.has(3)
+    facts_of, relays.first.facts_of = relays.first.facts_of, None
+    relays.first.facts_of = lambda robot: 1 // 0  # type: ignore[assignment, return-value]
+    relays.passes(2)
+    relays.first.facts_of = facts_of
+    relays.passes(PERIOD * ROUNDS)
+    assert relays.second.find(3) == facts()
 
 
 @pytest.mark.parametrize("body", [b"", b"{}", b'["a",[[1,{}]]]', b'["a",[["x",null]]]'])

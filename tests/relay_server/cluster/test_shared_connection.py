@@ -442,8 +442,33 @@ def test_what_the_other_relay_has_read_is_confirmed() -> None:
     pair.moves()
     assert confirmed == [(False, b""), (True, b"stop again")]
     mine.transport.confirm(1.0).addCallback(confirmed.append)
+    mine.transport.loseConnection()
+    mine.transport.confirm(1.0).addCallback(confirmed.append)
+    assert confirmed[2:] == [False]
     pair.door.connectionLost()
     mine.transport.confirm(1.0).addCallback(confirmed.append)
-    assert confirmed[2:] == [False, False]
+    assert confirmed[2:] == [False, False, False]
     pair.clock.advance(0)
     assert not pair.clock.getDelayedCalls()
+
+
+def test_a_confirmation_behind_other_bytes_is_waited_for_longer() -> None:
+    """Not for ever: the way there may be cut, and not the way back."""
+    pair = Pair()
+    mine, other = pair.opened()
+    confirmed: list[bool] = []
+    for _ in range(2):
+        mine.transport.confirm(1.0).addCallback(confirmed.append)
+        pair.clock.advance(0.5)
+        asked = pair.wires[0].value()
+        pair.wires[0].clear()
+        other.transport.write(b"sample")
+        pair.moves()
+        pair.clock.pump([0.25] * 6)
+        assert confirmed == [True][: len(confirmed)]
+        if not confirmed:
+            pair.home.dataReceived(asked)
+            pair.moves()
+            assert confirmed == [True]
+    pair.clock.pump([0.25] * 4)
+    assert confirmed == [True, False]

@@ -78,8 +78,10 @@ def test_each_relay_answers_for_itself(clock: Clock) -> None:
     ("relay", "works"),
     [
         (info("a"), True),
+        (info("a", 1, 1), True),
         (info("a", 2, 1), True),
-        (info("a", 2, 2), False),
+        (info("a", 3, 2), True),
+        (info("a", 3, 3), False),
         (info("a", 0, 0), False),
     ],
 )

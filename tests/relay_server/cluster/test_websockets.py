@@ -19,7 +19,13 @@ from relay_protocol.scopes import Scope
 from relay_server.access import BadCredentials, Principal
 from relay_server.cluster.forwarding import ForwardedClient, check_secret
 from relay_server.cluster.relays import RelayInfo
-from relay_server.cluster.websockets import ForwardedHandshake, ForwardedWebSocket, _HomeConnection
+from relay_server.cluster.websockets import (
+    PAUSED_BYTES,
+    PAUSED_SECONDS,
+    ForwardedHandshake,
+    ForwardedWebSocket,
+    _HomeConnection,
+)
 from relay_server.common import websocket_frames
 
 HEAD = b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\n\r\n"
@@ -31,6 +37,7 @@ class Client:
 
     def __init__(self) -> None:
         self.sent = b""
+        self.answers: list[bytes] = []
         self.whole: list[bytes] = []
         self.ended: Any = None
 
@@ -299,6 +306,48 @@ def test_a_home_that_goes_in_the_middle_of_a_frame_drops_the_client() -> None:
     endpoints.protocol.dataReceived(websocket_frames.binary(bytes(1000))[:500])
     endpoints.protocol.connectionLost()
     assert transport.closed == "dropped"
+
+
+@pytest.mark.parametrize(
+    ("before", "rest"),
+    [
+        (b"", b""),
+        (websocket_frames.text(b"status"), b""),
+        (websocket_frames.binary(bytes(1000))[:500], bytes(504)),
+        (fragment(0x01), fragment(0x80)),
+        (fragment(0x01) + b"\x89\x01x", fragment(0x00) + fragment(0x80)),
+    ],
+)
+def test_an_answer_of_this_relay_divides_no_message_of_the_home(before: bytes, rest: bytes) -> None:
+    _, endpoints, transport, session, _ = forwarded()
+    endpoints.protocol.dataReceived(HEAD + before)
+    session.start()
+    session.answer(b"answer")
+    assert transport.sent == before + (b"" if rest else b"answer")
+    for at in range(len(rest)):
+        endpoints.protocol.dataReceived(rest[at : at + 1])
+    assert transport.sent == before + rest + b"answer"
+
+
+def test_a_client_is_read_again_while_the_home_takes_nothing_for_long() -> None:
+    """It may stop the robot. What it sends otherwise is bounded."""
+    clock, endpoints, transport, session, _ = forwarded()
+    endpoints.protocol.dataReceived(HEAD)
+    session.start()
+    endpoints.home.producer.pauseProducing()
+    clock.advance(PAUSED_SECONDS)
+    assert transport.transport.producerState == "producing"
+    seen: list[bytes] = []
+    session.on_message = lambda payload, binary: seen.append(payload)
+    session.message(b"stop")
+    assert seen == [b"stop"]
+    session.message(bytes(PAUSED_BYTES))
+    assert transport.transport.producerState == "paused"
+    endpoints.home.producer.resumeProducing()
+    assert transport.transport.producerState == "producing"
+    endpoints.home.producer.pauseProducing()
+    session.end()
+    assert not clock.getDelayedCalls()
 
 
 def test_what_a_stalled_home_does_not_take_is_bounded() -> None:
