@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection
 from functools import partial
@@ -25,6 +26,9 @@ from relay_server.recordings.recordings import Recordings
 from relay_server.robots.registry import RobotRegistry
 from relay_server.service_registry.leases import LeaseExpiry
 from relay_server.video.streams import CameraStreams
+
+STOPS_SECONDS = 1.0
+"""Seconds between reads of stops that may have ended at another relay of the cluster."""
 
 
 class ChangeWatcher:
@@ -59,6 +63,9 @@ class ChangeWatcher:
         self._seconds = seconds
         self._revision = -1
         self._checking = SingleFlight(self._check)
+        self._stops_read_at = -math.inf
+        self.several_relays = False
+        """Whether other relays of a cluster change the database too."""
         self.on_applied: Callable[[int], object] = lambda revision: None
         """Called with each revision of the database after it was applied."""
 
@@ -83,6 +90,14 @@ class ChangeWatcher:
         read_at, revision = self._seconds(), await self._store.read(queries.revision)
         if revision != self._revision:
             await self._apply(revision)
+        elif (
+            self.several_relays
+            and read_at - self._stops_read_at >= STOPS_SECONDS
+            and self._controllers.waits_in_database
+        ):
+            # The end of a stop counts up no revision.
+            self._stops_read_at = read_at
+            await self._controllers.read_stored_stops()
         self._access.set_known_until(read_at)
 
     async def _apply(self, revision: int) -> None:

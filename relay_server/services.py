@@ -172,6 +172,7 @@ def _join_cluster(
     if cluster is None:
         return
     cluster.notices.apply = changes.apply
+    changes.several_relays = True
     cluster.robot_facts.facts_of = sessions.overview.facts_of
     sessions.overview.facts_elsewhere = cluster.robot_facts.find
     cluster.alert_notices.take = alerts.mirror

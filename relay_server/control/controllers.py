@@ -110,6 +110,11 @@ class Controllers:
         read_at = self._clock_ns()
         self._take_stored(await self._stop_store.pending_stops(), read_at)
 
+    @property
+    def waits_in_database(self) -> bool:
+        """Whether the database has stops for robots that are not connected to this relay, as far as is known."""
+        return bool(self._stored_stops) or any(each.stopping.waits_in_database for each in self)
+
     def _take_stored(self, stops: Iterable[StopRecord], read_at: int) -> None:
         now, before = self._clock_ns(), self._stored_stops
         self._stored_stops = {stop.robot_id: _StoredStop(stop, now) for stop in stops}

@@ -392,6 +392,11 @@ class StopController:
             and self._pending is None
         )
 
+    @property
+    def waits_in_database(self) -> bool:
+        """Whether a stop is stored that another relay of a cluster may have confirmed, as the robot is not here."""
+        return self._pending is not None and self._robot.control_link is None
+
     def _check_ended_elsewhere(self, read_at: int) -> None:
         """Forget a pending stop that is stored no longer: the relay with the robot had it confirmed, or withdrawn.
 

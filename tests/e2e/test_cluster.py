@@ -667,6 +667,26 @@ def test_a_home_that_stands_still_lets_no_request_wait(fleet: Fleet) -> None:
         fleet.first.thaw()
 
 
+def test_a_stop_that_waits_for_its_robot_ends_at_each_relay(fleet: Fleet) -> None:
+    """By a resume at one of them, or when the robot has confirmed it to one of them."""
+    fleet.robot.goes()
+    for relay in fleet.relays:
+        wait_for("the robot is away", lambda relay=relay: fleet.state(relay) == "offline")
+    for at, ends in enumerate((lambda: fleet.first.cli("resume", "rover"), fleet.robot.comes)):
+        assert fleet.request("POST", fleet.relays[at], "/stop", json={"why": "away"}).status_code == 202
+        for relay in fleet.relays:
+            wait_for("it shows the stop", lambda relay=relay: fleet.listed(relay)["stopped"])
+        ends()
+        for relay in fleet.relays:
+            wait_for(
+                "it shows the stop as pending no longer",
+                lambda relay=relay: (fleet.listed(relay)["stopped"] or {"confirmed": True})["confirmed"],
+            )
+    fleet.resume(fleet.second)
+    for relay in fleet.relays:
+        wait_for("it shows no stop", lambda relay=relay: fleet.listed(relay)["stopped"] is None)
+
+
 def services(foxglove: Any) -> list[dict[str, Any]]:
     """The services that a Foxglove client gets first."""
     while True:

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from relay_server.cli.admin_socket_client import ask_status
 from tests.worlds.driving import LATE_MS
 from tests.worlds.http_requests import Answer, ask
 from tests.worlds.machine_pauses import Pulse
@@ -233,13 +234,17 @@ def test_a_robot_that_is_away_is_stopped_when_it_comes_back(scene: ControlWorld)
     wait_for("the robot is offline", lambda: scene.relay.state_of("rover") == "offline")
     (answer,) = scene.relay.cli("stop", "rover", "--why", "maintenance")["robots"]
     assert (answer["robot"], answer["done"], answer["stopped"]["why"]) == ("rover", False, "maintenance")
+    wait_for("it is pending", lambda: scene.control()["stopped"])
     assert scene.control()["stopped"]["confirmed"] is False
     assert scene.http("POST", "stop", "vic").status == 202
+    # A resume does not end a stop that its relay does not know of yet.
+    wait_for("the relay knows it", lambda: "'vic'" in str(ask_status(scene.relay.data)["robots"]))
     scene.relay.cli("resume", "rover")
-    assert scene.control()["stopped"] is None
+    wait_for("it is withdrawn", lambda: scene.control()["stopped"] is None)
     scene.relay.stop()
     assert scene.relay.cli("stop", "--all") == {"robots": [{"robot": "rover", "done": False}]}
     scene.relay.start()
+    wait_for("it is pending", lambda: scene.control()["stopped"])
     assert scene.control()["stopped"]["confirmed"] is False
     scene.robot.start_daemon()
     scene.robot.wait_online()
@@ -247,7 +252,7 @@ def test_a_robot_that_is_away_is_stopped_when_it_comes_back(scene: ControlWorld)
     shown = ask(scene.relay.http_port, "GET", "/api/v1/robots", token=scene.tokens["vic"]).json["robots"][0]
     assert shown["stopped"]["confirmed"] is True
     assert "may move again" in scene.relay.run_cli("resume", "rover").stdout
-    assert scene.control()["stopped"] is None
+    wait_for("it is resumed", lambda: scene.control()["stopped"] is None)
 
 
 def test_a_right_that_is_revoked_ends_control(scene: ControlWorld) -> None:

@@ -1,5 +1,6 @@
 """With ``--other-relay``, the clients of all tests connect to another relay of a cluster than the robots.
 
+Each relay that a test starts has two others and three NATS servers. Its clients connect to one of the two by chance.
 What holds for one relay must hold there too, except for what docs/operate/cluster.md excludes.
 """
 
@@ -7,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import itertools
+import random
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 
 import psycopg
 
-from tests.worlds.nats_servers import NatsServer, nats_server
+from tests.worlds.nats_servers import NatsServer, nats_cluster
 from tests.worlds.postgresql_server import postgresql_database
 from tests.worlds.processes import Process
 from tests.worlds.relay_process import Relay
@@ -24,7 +26,7 @@ SECRET = "0123456789abcdef" * 2
 
 
 class Servers:
-    """One PostgreSQL for all relays of the tests, and a NATS server for each cluster."""
+    """One PostgreSQL for all relays of the tests, and three NATS servers for each cluster."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
@@ -42,67 +44,86 @@ class Servers:
             connection.execute(f'CREATE DATABASE "{name}"')
         return self._url.replace("/relay?", f"/{name}?")
 
-    def bus(self) -> NatsServer:
-        """A new server."""
-        return self._stack.enter_context(nats_server(self._folder / f"nats{next(self._numbers)}"))
+    def bus(self) -> list[NatsServer]:
+        """New servers."""
+        return self._stack.enter_context(nats_cluster(self._folder / f"nats{next(self._numbers)}"))
 
 
-class RelayPair:
-    """The other relay of one that a test starts."""
+class OtherRelays:
+    """The two others of a relay that a test starts.
+
+    :ivar ports: of the two for clients
+    :ivar home_port: of the relay itself
+    :ivar chosen: the place of the one that clients connect to
+    """
 
     def __init__(self, relay: Any, servers: Servers) -> None:
-        self.bus = servers.bus()
+        bus = ",".join(each.url for each in servers.bus())
         secret = relay.folder / "secret"
         secret.parent.mkdir(parents=True, exist_ok=True)
         secret.write_text(SECRET + "\n")
-        more = ["--cluster-bus", self.bus.url, "--cluster-secret", str(secret)]
+        more = ["--cluster-bus", bus, "--cluster-secret", str(secret)]
         self.options = [*relay._options, *more]
         if "--name" not in relay._options:
             self.options += ["--name", NAME]
         self.home_port = 0
-        self.port = 0
-        self.process: Process | None = None
+        self.ports = [0, 0]
+        self.chosen = random.randrange(2)
+        self._processes: list[Process] = []
+
+    def start(self, relay: Any) -> None:
+        """Start both."""
+        from tests.worlds.processes import BIN
+
+        for at, port in enumerate(self.ports):
+            command = [str(BIN / "switchboard"), "serve", "--data", str(relay.folder / f"other-relay-{at}")]
+            command += [*self.options, "--http", f"127.0.0.1:{port}", "--robots", "127.0.0.1:0"]
+            process = Process(command, relay.folder, f"other-relay-{at}", relay._environment)
+            self._processes.append(process)
+            words = dict(word.split("=") for word in process.wait_to_say("READY").split()[1:])
+            self.ports[at] = int(words["http"])
+
+    def kill(self) -> None:
+        """End both at once."""
+        for each in self._processes:
+            each.kill()
+        self._processes.clear()
 
 
 def install() -> None:
-    """Have each relay of the tests started with another one, at which clients connect."""
+    """Have each relay of the tests started with two others, at one of which clients connect."""
     servers = Servers()
     start, kill, stop, init = Relay.start, Relay.kill, Relay.stop, Relay.__init__
 
     def with_database(relay: Any, folder: Path, *options: str, database: str | None = None) -> None:
         alone = "--cluster-bus" in options or "--workers" in options
-        relay.pair = None
+        relay.others = None
         relay.alone = alone
         init(relay, folder, *options, database=database or (None if alone else servers.database()))
 
-    def start_both(relay: Any) -> None:
+    def start_all(relay: Any) -> None:
         if relay.alone:
             start(relay)
             return
-        if relay.pair is None:
-            relay.pair = RelayPair(relay, servers)
-            relay._options = tuple(relay.pair.options)
-        pair = relay.pair
-        relay.http_port = pair.home_port
+        if relay.others is None:
+            relay.others = OtherRelays(relay, servers)
+            relay._options = tuple(relay.others.options)
+        others = relay.others
+        relay.http_port = others.home_port
         start(relay)
-        pair.home_port = relay.http_port
-        from tests.worlds.processes import BIN
+        others.home_port = relay.http_port
+        others.start(relay)
+        relay.http_port = others.ports[others.chosen]
 
-        command = [str(BIN / "switchboard"), "serve", "--data", str(relay.folder / "other-relay-data")]
-        command += [*pair.options, "--http", f"127.0.0.1:{pair.port}", "--robots", "127.0.0.1:0"]
-        pair.process = Process(command, relay.folder, "other-relay", relay._environment)
-        words = dict(word.split("=") for word in pair.process.wait_to_say("READY").split()[1:])
-        pair.port = relay.http_port = int(words["http"])
-
-    def kill_both(relay: Any) -> None:
-        if relay.pair is not None and relay.pair.process is not None:
-            relay.pair.process.kill()
+    def kill_all(relay: Any) -> None:
+        if relay.others is not None:
+            relay.others.kill()
         kill(relay)
 
-    def stop_both(relay: Any) -> int:
-        if relay.pair is not None and relay.pair.process is not None:
-            relay.pair.process.kill()
+    def stop_all(relay: Any) -> int:
+        if relay.others is not None:
+            relay.others.kill()
         return stop(relay)
 
     Relay.__init__ = with_database  # type: ignore[method-assign]
-    Relay.start, Relay.kill, Relay.stop = start_both, kill_both, stop_both  # type: ignore[method-assign]
+    Relay.start, Relay.kill, Relay.stop = start_all, kill_all, stop_all  # type: ignore[method-assign]
