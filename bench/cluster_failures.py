@@ -467,6 +467,8 @@ def trial(at: Scene, fault: str, stopped: bool, number: int) -> Ended:
             ended.stop = at.stop_by_another_way() if socket is None else at.stop_by_websocket(socket)
             confirmed, began = True, time.monotonic()
         time.sleep(seconds)
+    if ended.unconfirmed:
+        wait_for("it is resumed", at.resume, QUIET_SECONDS)
     if confirmed:
         wait_for("the robot is back", lambda: at.robot.connected, QUIET_SECONDS)
         time.sleep(1.0)
@@ -501,9 +503,12 @@ def trial(at: Scene, fault: str, stopped: bool, number: int) -> Ended:
 def main() -> int:
     """Try all; the code is 1 when a command was late, two had control, a stop was lost or driving never went on."""
     parser = argparse.ArgumentParser(prog="python -m bench.cluster_failures", description=__doc__)
-    parser.add_argument("faults", nargs="*", help=f"of {', '.join(FAULTS)}; all, if none is named")
+    parser.add_argument("faults", nargs="*", help=f"of these: {', '.join(FAULTS)}; all, if none is named")
     parser.add_argument("--runs", type=int, default=20, help="of each fault, driven and stopped")
     asked = parser.parse_args()
+    unknown = [each for each in asked.faults if each not in FAULTS]
+    if unknown:
+        parser.error(f"there is no fault '{unknown[0]}'; there are: {', '.join(FAULTS)}")
     bad = 0
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-")))
@@ -531,6 +536,11 @@ def main() -> int:
             stop = max(each.stop for each in ends)
             counts = " | ".join(str(wrong[each]) for each in ("late", "without control", "stops lost"))
             again = f", {wrong['never again']} times for ever" if wrong["never again"] else ""
+            again += (
+                f", {wrong['stops not confirmed']} stops not confirmed"
+                if wrong["stops not confirmed"]
+                else ""
+            )
             longest_stop = f"{stop:.1f} s" if stop else "-"
             seen = ", ".join(f"{what} ({count})" for what, count in said.most_common(8))
             print(

@@ -178,7 +178,12 @@ def _join_cluster(
     cluster.alert_notices.take = alerts.mirror
     alerts.on_written = cluster.alert_notices.written
     changes.on_applied = cluster.notices.applied
-    cluster.homes.on_moved = sessions.robot_moved
+
+    def moved(robot: RobotState) -> None:
+        sessions.robot_moved(robot)
+        core.controllers.of(robot).robot_moved()
+
+    cluster.homes.on_moved = moved
     cluster.homes.on_key_used_twice = partial(report_key_used_twice, core.bus)
     cluster.clients = lambda: sum(1 for _ in sessions)
     cluster.lag = lambda: core.access.lag

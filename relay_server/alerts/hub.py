@@ -10,7 +10,7 @@ from twisted.internet.defer import Deferred, DeferredLock
 from twisted.logger import Logger
 
 from relay_db import queries
-from relay_db.queries import AlertRecord, AlertRuleRecord
+from relay_db.queries import AlertRecord, AlertRuleRecord, RobotRecord
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.rights import Rules
 from relay_server.access import Access, Principal
@@ -56,6 +56,7 @@ class AlertHub:
     :param send: sends a message of a rule
     :param slot: a context that the message waits for, and holds while it is sent
     :ivar version: changes whenever pages have something else to show
+    :ivar on_written: called with alerts that were written, for other relays of a cluster; ``None``: there are none
     """
 
     log = Logger()
@@ -108,13 +109,14 @@ class AlertHub:
         """The monotonic time of each robot's latest registration."""
         self._daemon_started: dict[int, float] = {}
         """When each robot's daemon started, by the robot's clock."""
+        self._all_active: set[int] = set()
+        """Robots that have reported all open alerts since they registered."""
         self._unconfirmed: dict[int, set[Key]] = {}
         """Open alerts that a robot reported before its latest registration and not since."""
         self._controlled: set[int] = set()
         """Robots that were controlled through this relay, which sees a loss of control itself."""
         self._listeners: list[Callable[[str, AlertRecord], None]] = []
         self.on_written: Callable[[Collection[AlertRecord]], object] | None = None
-        """Called with alerts that were written, for the other relays of a cluster; ``None``: there are none."""
         self._rights: dict[int, tuple[object, dict[int, Rules]]] = {}
         """The latest result of :meth:`Access.robots`, and the same by robot, for each user."""
         self._handlers = self._event_handlers()
@@ -175,19 +177,18 @@ class AlertHub:
         await self.flush()
         for alert, (by, at) in (await self._store.read(queries.acknowledgements)).items():
             found = self.store.find(alert)
-            if found is not None and self._owns(found.robot_id):
+            if found is not None and self.owns(found.robot_id):
                 self.acknowledge(alert, by, at)
         robots = await self._store.read(queries.list_robots)
         there = {each.id for each in robots}
-        for each in robots:
-            if self._registry.is_elsewhere(each.id):
-                self._registry.robot(each.id, each.name, each.realm)
+        self._know_elsewhere(robots)
         for gone in {each.robot_id for each in self.store} - there:
             self.store.forget_robot(gone)
         for by_robot in (self._registered_at, self._daemon_started, self._unconfirmed, self._absent):
             for gone in by_robot.keys() - there:
                 del by_robot[gone]
         self._controlled &= there
+        self._all_active &= there
         self.version += 1
 
     async def purge(self) -> None:
@@ -216,6 +217,11 @@ class AlertHub:
         """The level of an open alert; ``None`` if it is not open."""
         found = self.store.find_open(robot.robot_id, kind, about)
         return None if found is None else found.level
+
+    def ended_since(self, robot: RobotState, kind: str, at: float) -> bool:
+        """Whether an alert has ended after a time, Unix seconds, and is not open."""
+        found = self.store.find_over(robot.robot_id, kind)
+        return found is not None and found.over is not None and found.over >= at
 
     def parts_of(self, robot: RobotState, kind: str) -> list[str]:
         """The parts (``about``) of the open alerts of a kind."""
@@ -252,6 +258,7 @@ class AlertHub:
 
     def _came_online(self, robot: RobotState, data: dict[str, Any]) -> None:
         self._registered_at[robot.robot_id] = self._clock.seconds()
+        self._all_active.discard(robot.robot_id)
         self._unconfirmed[robot.robot_id] = {
             (each.kind, each.about)
             for each in self.store.open_of(robot.robot_id)
@@ -260,7 +267,7 @@ class AlertHub:
         self.end(robot, kinds.OFFLINE)
 
     def _stopped(self, robot: RobotState, data: dict[str, Any]) -> None:
-        if self.level_of(robot, kinds.STOP) is None:
+        if self.owns(robot.robot_id) and self.level_of(robot, kinds.STOP) is None:
             text = stopped_by(str(data.get("user", "")), str(data.get("why", "")))
             self.raise_alert(robot, kinds.STOP, "", "warning", text)
 
@@ -279,6 +286,7 @@ class AlertHub:
 
     def _all_active_sent(self, robot: RobotState, data: dict[str, Any]) -> None:
         """End alerts that the robot has not reported again, where their kind has an end."""
+        self._all_active.add(robot.robot_id)
         unconfirmed = self._unconfirmed.get(robot.robot_id, set())
         for kind, about in [each for each in unconfirmed if not kinds.endless(each[0])]:
             unconfirmed.discard((kind, about))
@@ -327,7 +335,7 @@ class AlertHub:
         if self._runs % TOPICS_EVERY == 0:
             self._monitors.check_topics(now)
         if self._runs % SWEEP_EVERY == 0:
-            self._publish(self.store.sweep(self._now(), self._owns))
+            self._publish(self.store.sweep(self._now(), self.owns))
             self.version += 1
         if self._absent and now - self._began >= ABSENT_SECONDS and self._leads():
             self._report_absent()
@@ -406,19 +414,37 @@ class AlertHub:
     def mirror(self, alerts: Collection[AlertRecord]) -> None:
         """Show what other relays have written too. Only the owner of a robot's alerts changes them afterwards."""
         for each in alerts:
-            self.store.mirror(each, self._now())
+            robot = self._registry.find(each.robot_id)
+            if self.store.mirror(each, self._now()) and robot is not None and robot.control_link is not None:
+                self._mirrored(robot, each)
         self._publish(())
+
+    def _mirrored(self, robot: RobotState, alert: AlertRecord) -> None:
+        """An alert has become known after its robot has connected here: it counts only if the robot reports it."""
+        if alert.over is not None or alert.kind in kinds.RELAY_KINDS or alert.last >= robot.online_since:
+            return
+        if robot.robot_id not in self._all_active:
+            self._unconfirmed.setdefault(robot.robot_id, set()).add((alert.kind, alert.about))
+        elif not kinds.endless(alert.kind):
+            self.end(robot, alert.kind, alert.about)
 
     async def _mirror_stored(self) -> None:
         """Find what other relays have written, in case their notices were lost."""
         since = self._wall() - kinds.SHOWN_SECONDS
         self.mirror(await self._store.read(queries.recent_alerts, since))
+        self._know_elsewhere(await self._store.read(queries.list_robots))
+
+    def _know_elsewhere(self, robots: Collection[RobotRecord]) -> None:
+        """Know the robots of other relays, so that they are missed if they go."""
+        for each in robots:
+            if self._registry.is_elsewhere(each.id):
+                self._registry.robot(each.id, each.name, each.realm)
 
     def _not_mirrored(self, failure: Any) -> None:
         if not failure.check(SwitchboardError):
             self.log.failure("the alerts of other relays could not be read", failure)
 
-    def _owns(self, robot_id: int) -> bool:
+    def owns(self, robot_id: int) -> bool:
         """Whether the alerts of a robot are this relay's: the robot is here, or nowhere and this relay leads."""
         if self._registry.connected(robot_id):
             return True

@@ -125,6 +125,9 @@ class AlertSink(Protocol):
     def level_of(self, robot: RobotState, kind: str, about: str = "") -> str | None:
         """The level of an open alert; ``None`` if it is not open."""
 
+    def ended_since(self, robot: RobotState, kind: str, at: float) -> bool:
+        """Whether an alert has ended after a time, Unix seconds, and is not open."""
+
     def parts_of(self, robot: RobotState, kind: str) -> list[str]:
         """The parts of the open alerts of a kind."""
 
@@ -191,8 +194,10 @@ class Monitors:
                 self._leave(robot, wall)
                 continue
             self._presence(robot, now, wall)
-            self._battery(robot)
-            self._stop(robot, now)
+            if robot.control_link is not None:
+                self._battery(robot)
+            if robot.control_link is not None or self._leads():
+                self._stop(robot, now)
 
     def check_topics(self, now: float) -> None:
         """Check which topics have ceased; to be called about once a second."""
@@ -265,7 +270,9 @@ class Monitors:
     def _stop(self, robot: RobotState, now: float) -> None:
         stopped = robot.motion_state.stopped or self._controllers.snapshot(robot.robot_id).stopped
         if stopped is not None:
-            if self._sink.level_of(robot, kinds.STOP) is None:
+            # One that has ended at another relay may not have been read yet.
+            known = robot.control_link is None and self._sink.ended_since(robot, kinds.STOP, stopped.since)
+            if self._sink.level_of(robot, kinds.STOP) is None and not known:
                 self._sink.raise_alert(robot, kinds.STOP, "", "warning", stopped_by(stopped.by, stopped.why))
         elif now - self._online.get(robot.robot_id, ("", now))[1] > SETTLED_SECONDS:
             self._sink.end(robot, kinds.STOP)

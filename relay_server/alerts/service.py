@@ -206,7 +206,12 @@ class AlertService:
             raise Refused(f"acknowledging alerts of {found.robot} needs the level operator")
         fresh = found.over is None and found.ack_at is None
         name = self._alerts.name_of(principal, found)
-        found = self._alerts.acknowledge(alert_id, name, self._wall()) or found
+        if fresh and not self._alerts.owns(found.robot_id):
+            # Only that, so that nothing is written over what the relay of the robot knows of it.
+            found = await self._store.write(queries.acknowledge_alert, alert_id, name, self._wall())
+            self._alerts.mirror([found])
+        else:
+            found = self._alerts.acknowledge(alert_id, name, self._wall()) or found
         if fresh:
             await self._alerts.flush()
             self._bus.publish(

@@ -112,32 +112,49 @@ class AlertStore:
             if each.over is None:
                 robot.over.pop(key, None)
 
-    def mirror(self, record: AlertRecord, now: Moment) -> None:
+    def mirror(self, record: AlertRecord, now: Moment) -> bool:
         """Take over what another relay of the cluster has written, if it is newer; no user is notified again.
 
         If both have raised the same alert, before they knew of each other's, the one that began first stays.
+
+        :returns: whether it was taken over
         """
         robot = self._robots.setdefault(record.robot_id, _Robot(filled=now.tick))
         key = (record.kind, record.about)
-        lasts = robot.open.get(key)
-        mine = lasts if lasts is not None and lasts.id == record.id else robot.over.get(key)
-        if mine is not None and mine.id == record.id and _age(record) <= _age(mine):
-            return
+        lasts, over = robot.open.get(key), robot.over.get(key)
+        mine = lasts if lasts is not None and lasts.id == record.id else over
+        if (
+            lasts is not None
+            and lasts is mine
+            and not record.notification_count
+            and record.id not in self._changed
+        ):
+            # That relay has stopped before it could notify a user.
+            robot.marks[key] = _Marks(robot.marks[key].since)
+            robot.open[key] = lasts._replace(notification_count=0)
+            return False
+        if mine is not None and mine.id == record.id:
+            if _age(record) <= _age(mine):
+                return False
+        elif over is not None and record.over is not None and record.first < over.first:
+            return False
         if lasts is not None and lasts.id != record.id:
             if record.over is not None:
-                return
+                return False
             kept, other = sorted((lasts, record), key=lambda each: (each.first, each.id))
             self._changed[other.id] = other._replace(over=now.wall)
             self.states += 1
             if kept is lasts:
-                return
+                return False
         self.states += 1
         robot.open.pop(key, None)
         robot.over.pop(key, None)
         (robot.open if record.over is None else robot.over)[key] = record
         robot.marks[key] = _marks(record, now)
+        self._changed.pop(record.id, None)
         while len(robot.over) > MAX_OVER:
             _forget(robot, next(iter(robot.over)))
+        return True
 
     def take_changed(self) -> list[AlertRecord]:
         """The records to write, each once."""
@@ -157,6 +174,11 @@ class AlertStore:
         """An alert, if it is open."""
         robot = self._robots.get(robot_id)
         return None if robot is None else robot.open.get((kind, about))
+
+    def find_over(self, robot_id: int, kind: str, about: str = "") -> AlertRecord | None:
+        """An alert, if it has ended recently and is not open."""
+        robot, key = self._robots.get(robot_id), (kind, about)
+        return None if robot is None or key in robot.open else robot.over.get(key)
 
     def find(self, alert_id: str) -> AlertRecord | None:
         """An alert by its id."""
@@ -367,10 +389,10 @@ def _marks(record: AlertRecord, now: Moment) -> _Marks:
     return marks
 
 
-def _age(record: AlertRecord) -> tuple[float, int, int]:
+def _age(record: AlertRecord) -> tuple[float, int, bool, int, float]:
     """Greater for a later state of the same alert."""
-    latest = max(record.last, record.over or 0.0, record.ack_at or 0.0)
-    return latest, record.report_count, record.notification_count
+    latest, over = max(record.last, record.over or 0.0), record.over is not None
+    return latest, record.report_count, over, record.notification_count, record.ack_at or 0.0
 
 
 def _is_reserved(robot: _Robot, key: Key) -> bool:

@@ -360,7 +360,7 @@ class SharedConnection(TwistedProtocol):
     def confirm(self, seconds: float) -> Deferred[bool]:
         """Ask whether the other relay has read what was written before. For the side that has connected.
 
-        :returns: fires with false if that is not known within so many seconds, or three times as many if other bytes
+        :returns: fires with false if that is not known within so many seconds, or twice as many if other bytes
             come meanwhile, behind which the answer may wait
         """
         if self._lost:
@@ -380,7 +380,7 @@ class SharedConnection(TwistedProtocol):
         else:
             self._confirming[number] = (
                 confirming,
-                self.clock.callLater(2 * seconds, self._confirm, number, False),
+                self.clock.callLater(seconds, self._confirm, number, False),
             )
 
     def _confirm(self, number: int, read: bool) -> None:

@@ -274,7 +274,11 @@ class ForwardedWebSocket:
         self._paused_bytes = 0
         self._transport.pause_reading()
         cancel(self._paused_timer)
-        self._paused_timer = self._clock.callLater(PAUSED_SECONDS, self._transport.resume_reading)
+        self._paused_timer = self._clock.callLater(PAUSED_SECONDS, self._read_paused)
+
+    def _read_paused(self) -> None:
+        if self._paused_bytes is not None and self._paused_bytes <= PAUSED_BYTES:
+            self._transport.resume_reading()
 
     def home_resumed(self) -> None:
         """The home takes bytes again."""

@@ -209,14 +209,21 @@ class RobotController:
         if holder is not None:
             self._note_lost(holder, why)
         self._note_lapsed(request, why)
-        # Its reported state no longer holds, except the stop, which the robot keeps.
-        self.robot.motion_state = link.MotionState(stopped=self.robot.motion_state.stopped)
+        # Its reported state no longer holds, except the stop, which the robot keeps. At another relay it may resume.
+        stopped = None if self.robot.elsewhere else self.robot.motion_state.stopped
+        self.robot.motion_state = link.MotionState(stopped=stopped)
         self._set_lease(self.lease.lost())
         self.suppression.link_lost()
         self.orders.link_lost()
         if holder is not None:
             self._notify_lost(holder, why)
         self._notify_request(request, why)
+
+    def robot_moved(self) -> None:
+        """Forget a stop that the robot reported here: it is connected to another relay, and may resume there."""
+        if self.robot.control_link is None and self.robot.motion_state.stopped is not None:
+            self.robot.motion_state = link.MotionState()
+            self._update()
 
     def graph_changed(self) -> None:
         """Do nothing: control does not depend on the graph."""

@@ -464,7 +464,7 @@ def test_a_confirmation_behind_other_bytes_is_waited_for_longer() -> None:
         pair.wires[0].clear()
         other.transport.write(b"sample")
         pair.moves()
-        pair.clock.pump([0.25] * 6)
+        pair.clock.pump([0.25] * 4)
         assert confirmed == [True][: len(confirmed)]
         if not confirmed:
             pair.home.dataReceived(asked)
