@@ -96,7 +96,7 @@ class AlertHub:
         self._wall = wall
         self._store = store
         self._access = access
-        self._registry = registry
+        self._registry, self._controllers = registry, controllers
         self._monitors = Monitors(registry, channels, controllers, thresholds, self, leads)
         self._loop = looping(clock, self._run)
         self._runs = 0
@@ -126,7 +126,7 @@ class AlertHub:
         return {
             "robot.online": self._came_online,
             "robot.stopped": self._stopped,
-            "robot.resumed": lambda robot, data: self.end(robot, kinds.STOP),
+            "robot.resumed": self._resumed,
             "robot.alert": self._robot_alert,
             "robot.active_alerts_sent": self._all_active_sent,
             "control.lost": self._control_lost,
@@ -270,6 +270,11 @@ class AlertHub:
         if self.owns(robot.robot_id) and self.level_of(robot, kinds.STOP) is None:
             text = stopped_by(str(data.get("user", "")), str(data.get("why", "")))
             self.raise_alert(robot, kinds.STOP, "", "warning", text)
+
+    def _resumed(self, robot: RobotState, data: dict[str, Any]) -> None:
+        # It may have been stopped again meanwhile.
+        if self._controllers.snapshot(robot.robot_id).stopped is None:
+            self.end(robot, kinds.STOP)
 
     def _robot_alert(self, robot: RobotState, data: dict[str, Any]) -> None:
         reported, part = str(data.get("alert_kind", "")), str(data.get("about", ""))

@@ -175,6 +175,8 @@ class Monitors:
         """When each robot was seen, by the wall clock, and when that was first noticed, by the monotonic one."""
         self._checked_at: float | None = None
         """The monotonic time of the last check."""
+        self._waiting_stops: set[int] = set()
+        """Robots that are away, and for which a stop has waited. Another relay may withdraw it."""
         self._maybe_offline: set[int] = set()
         """Robots that may be offline."""
         self._watches: dict[tuple[int, str, int], TopicWatch] = {}
@@ -193,8 +195,10 @@ class Monitors:
                 # The relay that it is connected to checks it.
                 self._leave(robot, wall)
                 continue
+            # Once more when its link has ended: the last that it reported may be an empty battery.
+            here = robot.control_link is not None or robot.robot_id in self._online
             self._presence(robot, now, wall)
-            if robot.control_link is not None:
+            if here:
                 self._battery(robot)
             if robot.control_link is not None or self._leads():
                 self._stop(robot, now)
@@ -240,6 +244,7 @@ class Monitors:
     def _leave(self, robot: RobotState, wall: float) -> None:
         self._online.pop(robot.robot_id, None)
         self._maybe_offline.discard(robot.robot_id)
+        self._waiting_stops.discard(robot.robot_id)
         robot.last_seen = wall
 
     def _silence(self, robot: RobotState, now: float, wall: float) -> float:
@@ -270,11 +275,18 @@ class Monitors:
     def _stop(self, robot: RobotState, now: float) -> None:
         stopped = robot.motion_state.stopped or self._controllers.snapshot(robot.robot_id).stopped
         if stopped is not None:
-            # One that has ended at another relay may not have been read yet.
-            known = robot.control_link is None and self._sink.ended_since(robot, kinds.STOP, stopped.since)
+            waits = robot.control_link is None and robot.motion_state.stopped is None
+            if waits:
+                self._waiting_stops.add(robot.robot_id)
+            # That one has ended at another relay may not have been read yet.
+            known = waits and self._sink.ended_since(robot, kinds.STOP, stopped.since)
             if self._sink.level_of(robot, kinds.STOP) is None and not known:
                 self._sink.raise_alert(robot, kinds.STOP, "", "warning", stopped_by(stopped.by, stopped.why))
-        elif now - self._online.get(robot.robot_id, ("", now))[1] > SETTLED_SECONDS:
+        elif (
+            robot.robot_id in self._waiting_stops
+            or now - self._online.get(robot.robot_id, ("", now))[1] > SETTLED_SECONDS
+        ):
+            self._waiting_stops.discard(robot.robot_id)
             self._sink.end(robot, kinds.STOP)
 
     # --- topics -------------------------------------------------------------------------------------------

@@ -208,7 +208,11 @@ class AlertService:
         name = self._alerts.name_of(principal, found)
         if fresh and not self._alerts.owns(found.robot_id):
             # Only that, so that nothing is written over what the relay of the robot knows of it.
-            found = await self._store.write(queries.acknowledge_alert, alert_id, name, self._wall())
+            try:
+                found = await self._store.write(queries.acknowledge_alert, alert_id, name, self._wall())
+            except Invalid:
+                # It has ended there meanwhile.
+                found = await self._store.read(queries.get_alert, alert_id) or found
             self._alerts.mirror([found])
         else:
             found = self._alerts.acknowledge(alert_id, name, self._wall()) or found

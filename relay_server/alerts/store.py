@@ -55,12 +55,14 @@ class _Marks:
     :param notified: of the last notification that it began or became worse
     :param severity: of its level then
     :param announced: users know that it lasts
+    :param own: this relay has announced it last
     """
 
     since: float
     notified: float = -inf
     severity: int = -1
     announced: bool = False
+    own: bool = False
 
 
 @dataclass
@@ -123,15 +125,12 @@ class AlertStore:
         key = (record.kind, record.about)
         lasts, over = robot.open.get(key), robot.over.get(key)
         mine = lasts if lasts is not None and lasts.id == record.id else over
-        if (
-            lasts is not None
-            and lasts is mine
-            and not record.notification_count
-            and record.id not in self._changed
-        ):
+        if lasts is not None and lasts is mine and not record.notification_count and not robot.marks[key].own:
             # That relay has stopped before it could notify a user.
             robot.marks[key] = _Marks(robot.marks[key].since)
-            robot.open[key] = lasts._replace(notification_count=0)
+            robot.open[key] = unreported = lasts._replace(notification_count=0)
+            if record.id in self._changed:
+                self._changed[record.id] = unreported
             return False
         if mine is not None and mine.id == record.id:
             if _age(record) <= _age(mine):
@@ -277,7 +276,9 @@ class AlertStore:
         for robot_id, robot in list(self._robots.items()):
             for key, each in list(robot.open.items()) if owned(robot_id) else ():
                 marks = robot.marks[key]
-                if now.tick - marks.since >= _timeout(each.kind):
+                # An acknowledgement may have been written while no relay owned it.
+                acknowledged = kinds.endless(each.kind) and each.ack_at is not None
+                if acknowledged or now.tick - marks.since >= _timeout(each.kind):
                     changes += self._end(robot, each, now)
                 elif not marks.announced:
                     changes += self._announce_return(robot, each, now)
@@ -363,6 +364,7 @@ class AlertStore:
         self.states += 1
         marks = robot.marks[alert.kind, alert.about]
         marks.notified, marks.severity, marks.announced = now.tick, kinds.severity(alert.level), True
+        marks.own = True
         return AlertChange(self._put(robot, alert), event)
 
     def _put(self, robot: _Robot, alert: AlertRecord) -> AlertRecord:

@@ -32,6 +32,9 @@ class RecordingSink:
     def level_of(self, robot: RobotState, kind: str, about: str = "") -> str | None:
         return self.now.get((kind, about))
 
+    def ended_since(self, robot: RobotState, kind: str, at: float) -> bool:
+        return False
+
     def parts_of(self, robot: RobotState, kind: str) -> list[str]:
         """Parts with an open alert of this kind."""
         return [about for each, about in self.now if each == kind]
@@ -152,6 +155,16 @@ def test_a_robot_that_was_never_online_raises_no_alert(scene: Scene) -> None:
 
 
 # --- batteries --------------------------------------------------------------------------------------------
+
+
+def test_the_last_that_a_robot_reported_of_its_battery_counts(scene: Scene) -> None:
+    """It is empty when the link ends, before the next check."""
+    scene.world.robot_comes()
+    scene.goes_on(1)
+    scene.world.robot.health = link.Health(battery=0.03)
+    scene.world.robot_goes()
+    scene.goes_on(1)
+    assert scene.sink.reported == ["battery error"]
 
 
 def test_a_battery_is_low_critical_and_well_again_with_hysteresis(scene: Scene) -> None:

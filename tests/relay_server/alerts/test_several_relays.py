@@ -242,6 +242,7 @@ def test_one_relay_raises_the_alert_of_a_stop_that_waits(cluster: Cluster) -> No
     cluster.first.says("robot.stopped", user="ann", why="smoke")
     cluster.passes(2)
     assert cluster.notified == ["stop begun"]
+    cluster.first.world.controllers.of(cluster.first.robot).stopping.add_stored(None, 1, 2)
     cluster.first.says("robot.resumed")
     cluster.passes(5)
     assert sorted(cluster.notified) == ["stop begun", "stop over"]
@@ -322,6 +323,65 @@ def test_a_notification_that_a_relay_could_not_deliver_is_repeated_by_the_next(c
     assert second.notified == []
     cluster.passes(30)
     assert second.notified == ["diagnostics begun"]
+
+
+def test_a_notification_that_was_not_delivered_is_not_lost_among_new_reports(cluster: Cluster) -> None:
+    """The relay that the robot has moved to is about to write its own state."""
+    first, second = cluster.members
+    cluster.comes(first)
+    first.reports()
+    cluster.passes(1)
+    cluster.goes(first)
+    cluster.comes(second)
+    (alert,) = second.hub.store
+    second.reports()
+    second.hub.mirror([alert._replace(notification_count=0)])
+    cluster.passes(30)
+    assert second.notified == ["diagnostics begun"]
+    # What was read before that was announced does not announce it again.
+    second.hub.mirror([alert._replace(notification_count=0)])
+    cluster.passes(60)
+    assert second.notified == ["diagnostics begun"]
+
+
+def test_a_stop_alert_ends_where_its_stop_was_withdrawn_before_it_was_known(cluster: Cluster) -> None:
+    """The leading relay raises it late, and reads then that the stop is gone."""
+    stop = queries.StopRecord(cluster.number, "ann", "smoke", cluster.first.wall(), "")
+    stopping = cluster.second.world.controllers.of(cluster.second.robot).stopping
+    cluster.first.says("robot.stopped", user="ann", why="smoke")
+    cluster.first.says("robot.resumed")
+    stopping.add_stored(stop, 1, 1)
+    cluster.passes(2)
+    stopping.add_stored(None, 1, 2)
+    cluster.passes(2)
+    assert cluster.first.shown == cluster.second.shown == cluster.stored == [("stop", False)]
+
+
+def test_a_robot_that_is_stopped_again_while_it_is_resumed_has_an_alert(cluster: Cluster) -> None:
+    """With one relay too."""
+    second = cluster.second
+    stopping = second.world.controllers.of(second.robot).stopping
+    for at in (1, 2):
+        at_time = second.wall() + at
+        stopping.add_stored(queries.StopRecord(cluster.number, "bob", "fire", at_time, ""), at, at)
+        cluster.passes(2)
+    second.says("robot.resumed")
+    cluster.passes(5)
+    assert second.shown == [("stop", True)]
+
+
+def test_an_acknowledgement_that_came_while_no_relay_led_ends_what_has_no_end(cluster: Cluster) -> None:
+    first, second = cluster.members
+    second.says("control.lost", user="ann", why="gone", moving=True)
+    cluster.passes(1)
+    (alert,) = first.hub.store
+    second.leads = False
+    done(first.service.acknowledge(cluster.ann, alert.id))
+    for member in cluster.members:
+        done(member.hub.refresh())
+    first.leads = True
+    cluster.passes(15)
+    assert first.shown == second.shown == cluster.stored == [("control", False)]
 
 
 def test_a_part_that_fails_again_and_again_is_one_alert(cluster: Cluster) -> None:
